@@ -44,8 +44,7 @@ from limbfit.identify.fit.prediction import PredictionModel
 from limbfit.indentation import SimulationJob, SiteModel, simulate
 from limbfit.laws import to_vector
 from limbfit.mesh import write_vtu
-from limbfit.phantom.record import record
-from limbfit.phantom.sites import Ramp
+from limbfit.phantom.indentations import Ramp, record
 from limbfit.pipeline.engine.context import Context
 from limbfit.pipeline.engine.storage import write_json
 from limbfit.pipeline.engine.store import COARSE, Store

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from limbfit.phantom import build
+from limbfit.phantom.indentations import TrueForce, simulate_true_force
 from limbfit.phantom.mri import DETAIL_GRIDS
-from limbfit.phantom.record import TrueForce, simulate_true_force
 
 SPACING_MM = 8.0  # of the grids on which surfaces are contoured
 VOXELS = ((44, 30, 30), (5.9, 5.8, 6.0))

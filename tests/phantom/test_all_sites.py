@@ -9,14 +9,15 @@ from layered import layered_block
 from limbfit.anatomy.surfaces.surfaces import save_anatomy
 from limbfit.phantom.build import draw_true_parameters
 from limbfit.phantom.geometry import build_true_anatomy, make_limb
-from limbfit.phantom.record import (
+from limbfit.phantom.indentations import (
     DISCRETISATIONS,
     ForceJob,
     SecondaryMeasurements,
+    TrueSite,
+    build_true_sites,
     mesh_true_site,
     simulate_true_force,
 )
-from limbfit.phantom.sites import TrueSite, build_true_sites
 from small_limb import limb
 
 NAMES = [f"{number:02d}" for number in range(1, 19)]

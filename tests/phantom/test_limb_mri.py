@@ -11,6 +11,7 @@ import SimpleITK as sitk  # noqa: N813
 
 from limbfit.anatomy.grid import BONES
 from limbfit.phantom.geometry import SKIN_AND_FAT, make_limb
+from limbfit.phantom.indentations import build_markers, build_true_sites
 from limbfit.phantom.mri import (
     BIAS,
     FULL_SCALE,
@@ -22,7 +23,6 @@ from limbfit.phantom.mri import (
     make_grid,
     write_series,
 )
-from limbfit.phantom.sites import build_markers, build_true_sites
 
 
 @pytest.fixture(scope="module")

@@ -35,7 +35,7 @@ from ..indentation import Parameters
 from ..socket import Area, Recipe, Socket, read_socket, rectify_limb
 from ..socket.landmarks import Directions, build_default_regions, find_directions, find_knee_centre
 from ..socket.trim import Trim
-from . import record as robot
+from . import indentations
 from .geometry import (
     SKIN_AND_FAT,
     SKIN_LAYER,
@@ -45,16 +45,8 @@ from .geometry import (
     build_true_anatomy,
     make_limb,
 )
+from .indentations import DETAIL_SITES, INDENTER_EDGE_MM, INDENTER_MM, TrueForce, TrueSite, select_sites
 from .mri import DETAIL_GRIDS, LABELS_FILE, TENDON_LABEL, build_true_labels, make_grid, write_series
-from .sites import (
-    DETAIL_SITES,
-    INDENTER_EDGE_MM,
-    INDENTER_MM,
-    TrueSite,
-    build_markers,
-    build_true_sites,
-    select_sites,
-)
 
 Mapping = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
 Listener = Callable[[str, float, float], None]
@@ -102,7 +94,7 @@ class _Patient:
     marked: tuple[TrueSite, ...]
     indented: tuple[TrueSite, ...]
     parameters: Parameters
-    measurements: robot.SecondaryMeasurements
+    measurements: indentations.SecondaryMeasurements
     has_socket: bool
 
 
@@ -171,7 +163,7 @@ def make_phantom(
     if detail not in DETAIL_GRIDS:
         raise InputError(f"unknown detail {detail!r}", remedy=f"use one of {', '.join(DETAIL_GRIDS)}")
     made_limb = make_limb(seed, SKIN_AND_FAT if fat else SKIN_LAYER, tendon, limb)
-    marked = build_true_sites(made_limb, seed)
+    marked = indentations.build_true_sites(made_limb, seed)
     patient = _Patient(
         seed=seed,
         detail=detail,
@@ -179,7 +171,7 @@ def make_phantom(
         marked=marked,
         indented=select_sites(marked, DETAIL_SITES[detail] if sites is None else sites),
         parameters=draw_true_parameters(seed, fat, tendon),
-        measurements=robot.SecondaryMeasurements(ultrasound, surface, shear_waves),
+        measurements=indentations.SecondaryMeasurements(ultrasound, surface, shear_waves),
         has_socket=socket,
     )
     with _open_hidden_folder(folder) as work:
@@ -233,7 +225,7 @@ def _write_images(work: Path, patient: _Patient, tell: Listener) -> None:
     if limb.has_tendon:
         (work / LABELS_FILE.parent).mkdir()
         write_labels(work / LABELS_FILE, build_true_labels(limb, grid))
-    markers = build_markers(patient.marked)
+    markers = indentations.build_markers(patient.marked)
     series = (("plain", (), "UTE residuum"), ("markers", markers, "UTE residuum, markers"))
     for number, (name, shown, description) in enumerate(series, start=1):
         write_series(
@@ -256,38 +248,39 @@ def _write_traces(
     truth.mkdir()
     traces.mkdir()
     save_anatomy(truth, anatomy)
-    made, indented = robot.choose_discretisation(patient.detail, patient.limb.kind), patient.indented
+    made, indented = indentations.choose_discretisation(patient.detail, patient.limb.kind), patient.indented
     settings = replace(made.mesh, layers=patient.limb.layers)
-    mesh = partial(robot.mesh_true_site, folder=truth, settings=settings, within_mm=made.within_mm)
-    jobs: list[robot.ForceJob] = []
+    mesh = partial(indentations.mesh_true_site, folder=truth, settings=settings, within_mm=made.within_mm)
+    jobs: list[indentations.ForceJob] = []
     tell("meshes", 0, len(indented))
     for site, site_mesh in zip(indented, mapping(mesh, indented), strict=True):
         steps = made.steps(site.thickness)
-        jobs.append(robot.ForceJob(site, site_mesh, steps, patient.parameters, patient.measurements))
+        jobs.append(indentations.ForceJob(site, site_mesh, steps, patient.parameters, patient.measurements))
         tell("meshes", len(jobs), len(indented))
     tell("forces", 0, len(jobs))
     facts = []
-    for i, (site, found) in enumerate(zip(indented, mapping(robot.simulate_true_force, jobs), strict=True)):
+    forces = mapping(indentations.simulate_true_force, jobs)
+    for i, (site, found) in enumerate(zip(indented, forces, strict=True)):
         facts.append(_record_site(traces, site, found, patient.seed))
         tell("forces", i + 1, len(jobs))
     return facts
 
 
-def _record_site(traces: Path, site: TrueSite, simulated: robot.TrueForce, seed: int) -> dict[str, Any]:
+def _record_site(traces: Path, site: TrueSite, simulated: TrueForce, seed: int) -> dict[str, Any]:
     def follow(values: Array) -> Callable[[Array], Array]:
         return lambda t: np.interp(t, simulated.times, values)
 
     def draw(purpose: int) -> np.random.Generator:
         return np.random.default_rng([seed, purpose, int(site.name)])
 
-    made = robot.record(site.ramp, follow(simulated.force), draw(8))
+    made = indentations.record(site.ramp, follow(simulated.force), draw(8))
     made.write(traces / f"site-{site.name}.csv")
     if simulated.layers:
         layers = {tissue: (rest, follow(lost)) for tissue, (rest, lost) in simulated.layers.items()}
-        robot.write_ultrasound(traces / f"site-{site.name}-layers.csv", made, layers, draw(11))
+        indentations.write_ultrasound(traces / f"site-{site.name}-layers.csv", made, layers, draw(11))
     if len(simulated.skin_points):
         moves = interp1d(simulated.times, simulated.skin_moves)
-        robot.write_surface(
+        indentations.write_surface(
             traces / f"site-{site.name}-surface.csv",
             made,
             simulated.skin_points,
@@ -296,7 +289,7 @@ def _record_site(traces: Path, site: TrueSite, simulated: robot.TrueForce, seed:
         )
     if simulated.speeds:
         speeds = {tissue: follow(speed) for tissue, speed in simulated.speeds.items()}
-        robot.write_waves(traces / f"site-{site.name}-waves.csv", made, speeds, draw(13))
+        indentations.write_waves(traces / f"site-{site.name}-waves.csv", made, speeds, draw(13))
     return {
         **_site_to_dict(site),
         "depth_mm": site.depth,
@@ -322,7 +315,7 @@ def _site_to_dict(site: TrueSite) -> dict[str, Any]:
 
 def _truth_to_dict(patient: _Patient) -> dict[str, Any]:
     limb = patient.limb
-    made = robot.choose_discretisation(patient.detail, limb.kind)
+    made = indentations.choose_discretisation(patient.detail, limb.kind)
     return {
         "seed": patient.seed,
         "detail": patient.detail,

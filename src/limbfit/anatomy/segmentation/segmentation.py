@@ -11,17 +11,19 @@ from ...errors import ImageError
 from ..grid import BONES, DEFAULT_NAMES, FAT, LabelMap, Volume, find_proximal_end
 from ..morphology import Box, Field, compute_depth, find_box, find_largest_piece
 from .body import (
+    FAT_HU,
     Contrast,
     estimate_bias_field,
     estimate_muscle_level,
+    find_bright_fat,
     find_limb_axis,
     find_limb_mask,
     is_ct,
     rescale_above_air,
+    select_subcutaneous,
     smooth_image,
 )
 from .bones import find_bones, find_dense_bones, grow_from_seeds, name_bones
-from .fat import FAT_HU, find_bright_fat, select_subcutaneous
 
 Seeds = Mapping[str, ArrayLike]
 
