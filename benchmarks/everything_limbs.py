@@ -35,8 +35,8 @@ from limbfit.bench.meshing import (
 )
 from limbfit.phantom.build import draw_true_parameters
 from limbfit.phantom.geometry import extract_contour, make_limb
-from limbfit.phantom.indentations import Ramp, record
 from limbfit.phantom.mri import build_true_labels, make_grid
+from limbfit.phantom.robot import Ramp, record
 
 Array = NDArray[np.floating]
 

@@ -28,8 +28,8 @@ from limbfit.anatomy.sites.sites import Marker, find_markers, match_markers
 from limbfit.anatomy.surfaces.surfaces import Surface, build_anatomy
 from limbfit.errors import SiteError
 from limbfit.phantom.geometry import Limb, build_rotation, make_limb
-from limbfit.phantom.indentations import TrueSite, build_markers, build_true_sites
 from limbfit.phantom.mri import ScanGrid, make_grid
+from limbfit.phantom.robot import TrueSite, build_markers, build_true_sites
 from scanned import build_image
 
 SHIFT_MM, TURN_DEG = 5.0, 3.0

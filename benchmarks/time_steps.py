@@ -18,7 +18,7 @@ from material_point import compute_curve_error, solve_layer, solve_reference_lay
 from limbfit.fe import History, StepControl, solve
 from limbfit.indentation import SiteModel, build_problem
 from limbfit.mesh import read_vtu
-from limbfit.phantom.indentations import (
+from limbfit.phantom.robot import (
     INDENTER_EDGE_MM,
     INDENTER_MM,
     LOAD_STEPS,

@@ -14,7 +14,7 @@ from limbfit.execution import SerialExecutor
 from limbfit.indentation import Parameters, SimulationJob, SiteModel, simulate
 from limbfit.mesh import Mesh, boundary_faces, to_tet10, write_vtu
 from limbfit.mesh.cells import SIX_TETS, build_boxes
-from limbfit.phantom.indentations import Ramp, record
+from limbfit.phantom.robot import Ramp, record
 from limbfit.pipeline.engine.context import Context
 from limbfit.pipeline.engine.storage import write_json
 from limbfit.pipeline.engine.store import COARSE, Store

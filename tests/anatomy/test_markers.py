@@ -14,8 +14,8 @@ from limbfit.anatomy.surfaces.surfaces import extract_surface
 from limbfit.anatomy.surfaces.triangles import Surface
 from limbfit.errors import ImageError, SiteError
 from limbfit.phantom.geometry import build_rotation, make_limb
-from limbfit.phantom.indentations import build_markers, build_true_sites
 from limbfit.phantom.mri import make_grid
+from limbfit.phantom.robot import build_markers, build_true_sites
 from scanned import build_image
 
 SHIFT_MM, TURN_DEG = np.array([3.0, -2.5, 2.5]), 2.8

@@ -9,7 +9,7 @@ from layered import layered_block
 from limbfit.anatomy.surfaces.surfaces import save_anatomy
 from limbfit.phantom.build import draw_true_parameters
 from limbfit.phantom.geometry import build_true_anatomy, make_limb
-from limbfit.phantom.indentations import (
+from limbfit.phantom.robot import (
     DISCRETISATIONS,
     ForceJob,
     SecondaryMeasurements,

@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 from limbfit.anatomy.grid import BONES
 from limbfit.anatomy.surfaces.surfaces import check_closed
 from limbfit.phantom.geometry import Limb, build_rotation, build_true_anatomy, make_limb
-from limbfit.phantom.indentations import (
+from limbfit.phantom.robot import (
     DETAIL_SITES,
     FITTED,
     SAFE_SHARE,

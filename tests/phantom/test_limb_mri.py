@@ -11,7 +11,6 @@ import SimpleITK as sitk  # noqa: N813
 
 from limbfit.anatomy.grid import BONES
 from limbfit.phantom.geometry import SKIN_AND_FAT, make_limb
-from limbfit.phantom.indentations import build_markers, build_true_sites
 from limbfit.phantom.mri import (
     BIAS,
     FULL_SCALE,
@@ -23,6 +22,7 @@ from limbfit.phantom.mri import (
     make_grid,
     write_series,
 )
+from limbfit.phantom.robot import build_markers, build_true_sites
 
 
 @pytest.fixture(scope="module")

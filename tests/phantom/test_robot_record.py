@@ -5,7 +5,7 @@ import pytest
 
 from limbfit.errors import SiteError
 from limbfit.phantom.geometry import make_limb
-from limbfit.phantom.indentations import (
+from limbfit.phantom.robot import (
     CLEARANCE_MM,
     FORCE_NOISE_N,
     SPEED_MM_S,

@@ -35,18 +35,10 @@ from ..indentation import Parameters
 from ..socket import Area, Recipe, Socket, read_socket, rectify_limb
 from ..socket.landmarks import Directions, build_default_regions, find_directions, find_knee_centre
 from ..socket.trim import Trim
-from . import indentations
-from .geometry import (
-    SKIN_AND_FAT,
-    SKIN_LAYER,
-    TENDON,
-    Limb,
-    build_outer_surface,
-    build_true_anatomy,
-    make_limb,
-)
-from .indentations import DETAIL_SITES, INDENTER_EDGE_MM, INDENTER_MM, TrueForce, TrueSite, select_sites
+from . import geometry, robot
+from .geometry import SKIN_AND_FAT, SKIN_LAYER, TENDON, Limb
 from .mri import DETAIL_GRIDS, LABELS_FILE, TENDON_LABEL, build_true_labels, make_grid, write_series
+from .robot import DETAIL_SITES, INDENTER_EDGE_MM, INDENTER_MM, TrueForce, TrueSite, select_sites
 
 Mapping = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
 Listener = Callable[[str, float, float], None]
@@ -94,7 +86,7 @@ class _Patient:
     marked: tuple[TrueSite, ...]
     indented: tuple[TrueSite, ...]
     parameters: Parameters
-    measurements: indentations.SecondaryMeasurements
+    measurements: robot.SecondaryMeasurements
     has_socket: bool
 
 
@@ -162,8 +154,8 @@ def make_phantom(
     tell = progress or (lambda text, done, total: None)
     if detail not in DETAIL_GRIDS:
         raise InputError(f"unknown detail {detail!r}", remedy=f"use one of {', '.join(DETAIL_GRIDS)}")
-    made_limb = make_limb(seed, SKIN_AND_FAT if fat else SKIN_LAYER, tendon, limb)
-    marked = indentations.build_true_sites(made_limb, seed)
+    made_limb = geometry.make_limb(seed, SKIN_AND_FAT if fat else SKIN_LAYER, tendon, limb)
+    marked = robot.build_true_sites(made_limb, seed)
     patient = _Patient(
         seed=seed,
         detail=detail,
@@ -171,12 +163,12 @@ def make_phantom(
         marked=marked,
         indented=select_sites(marked, DETAIL_SITES[detail] if sites is None else sites),
         parameters=draw_true_parameters(seed, fat, tendon),
-        measurements=indentations.SecondaryMeasurements(ultrasound, surface, shear_waves),
+        measurements=robot.SecondaryMeasurements(ultrasound, surface, shear_waves),
         has_socket=socket,
     )
     with _open_hidden_folder(folder) as work:
         truth = _truth_to_dict(patient)
-        anatomy = build_true_anatomy(made_limb)
+        anatomy = geometry.build_true_anatomy(made_limb)
         if socket:
             truth["socket"] = write_socket(work, made_limb, anatomy)
         _write_images(work, patient, tell)
@@ -225,7 +217,7 @@ def _write_images(work: Path, patient: _Patient, tell: Listener) -> None:
     if limb.has_tendon:
         (work / LABELS_FILE.parent).mkdir()
         write_labels(work / LABELS_FILE, build_true_labels(limb, grid))
-    markers = indentations.build_markers(patient.marked)
+    markers = robot.build_markers(patient.marked)
     series = (("plain", (), "UTE residuum"), ("markers", markers, "UTE residuum, markers"))
     for number, (name, shown, description) in enumerate(series, start=1):
         write_series(
@@ -248,18 +240,18 @@ def _write_traces(
     truth.mkdir()
     traces.mkdir()
     save_anatomy(truth, anatomy)
-    made, indented = indentations.choose_discretisation(patient.detail, patient.limb.kind), patient.indented
+    made, indented = robot.choose_discretisation(patient.detail, patient.limb.kind), patient.indented
     settings = replace(made.mesh, layers=patient.limb.layers)
-    mesh = partial(indentations.mesh_true_site, folder=truth, settings=settings, within_mm=made.within_mm)
-    jobs: list[indentations.ForceJob] = []
+    mesh = partial(robot.mesh_true_site, folder=truth, settings=settings, within_mm=made.within_mm)
+    jobs: list[robot.ForceJob] = []
     tell("meshes", 0, len(indented))
     for site, site_mesh in zip(indented, mapping(mesh, indented), strict=True):
         steps = made.steps(site.thickness)
-        jobs.append(indentations.ForceJob(site, site_mesh, steps, patient.parameters, patient.measurements))
+        jobs.append(robot.ForceJob(site, site_mesh, steps, patient.parameters, patient.measurements))
         tell("meshes", len(jobs), len(indented))
     tell("forces", 0, len(jobs))
     facts = []
-    forces = mapping(indentations.simulate_true_force, jobs)
+    forces = mapping(robot.simulate_true_force, jobs)
     for i, (site, found) in enumerate(zip(indented, forces, strict=True)):
         facts.append(_record_site(traces, site, found, patient.seed))
         tell("forces", i + 1, len(jobs))
@@ -273,14 +265,14 @@ def _record_site(traces: Path, site: TrueSite, simulated: TrueForce, seed: int) 
     def draw(purpose: int) -> np.random.Generator:
         return np.random.default_rng([seed, purpose, int(site.name)])
 
-    made = indentations.record(site.ramp, follow(simulated.force), draw(8))
+    made = robot.record(site.ramp, follow(simulated.force), draw(8))
     made.write(traces / f"site-{site.name}.csv")
     if simulated.layers:
         layers = {tissue: (rest, follow(lost)) for tissue, (rest, lost) in simulated.layers.items()}
-        indentations.write_ultrasound(traces / f"site-{site.name}-layers.csv", made, layers, draw(11))
+        robot.write_ultrasound(traces / f"site-{site.name}-layers.csv", made, layers, draw(11))
     if len(simulated.skin_points):
         moves = interp1d(simulated.times, simulated.skin_moves)
-        indentations.write_surface(
+        robot.write_surface(
             traces / f"site-{site.name}-surface.csv",
             made,
             simulated.skin_points,
@@ -289,7 +281,7 @@ def _record_site(traces: Path, site: TrueSite, simulated: TrueForce, seed: int) 
         )
     if simulated.speeds:
         speeds = {tissue: follow(speed) for tissue, speed in simulated.speeds.items()}
-        indentations.write_waves(traces / f"site-{site.name}-waves.csv", made, speeds, draw(13))
+        robot.write_waves(traces / f"site-{site.name}-waves.csv", made, speeds, draw(13))
     return {
         **_site_to_dict(site),
         "depth_mm": site.depth,
@@ -315,7 +307,7 @@ def _site_to_dict(site: TrueSite) -> dict[str, Any]:
 
 def _truth_to_dict(patient: _Patient) -> dict[str, Any]:
     limb = patient.limb
-    made = indentations.choose_discretisation(patient.detail, limb.kind)
+    made = robot.choose_discretisation(patient.detail, limb.kind)
     return {
         "seed": patient.seed,
         "detail": patient.detail,
@@ -397,7 +389,7 @@ def _trim_around_tendon(anatomy: Anatomy, directions: Directions, knee: Array) -
 
 def write_socket(folder: Path, limb: Limb, anatomy: Anatomy) -> dict[str, Any]:
     """Write the socket of a limb into a study's folder and read it back; returns what is true of it."""
-    outer = build_outer_surface(limb, LINER_MM)
+    outer = geometry.build_outer_surface(limb, LINER_MM)
     socket, areas = make_socket(anatomy, outer, limb.kind)
     (folder / SOCKET_FILE).parent.mkdir()
     write_surface(folder / SOCKET_FILE, socket.surface)

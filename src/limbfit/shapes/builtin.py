@@ -37,7 +37,6 @@ class Square(Shape):
     variants: ClassVar = {"square": 0.0, "square, rounded edge": 0.1}
 
     def distance(self, points: Array) -> Distance:
-        """See `Shape.distance`."""
         return _compute_box_distances(points, self.width / 2, self.radius)
 
     def facets(self) -> Facets:
@@ -94,7 +93,6 @@ class Cylinder(Revolution):
         return self.width / 2 - self.radius
 
     def meridian(self, rho: Array, z: Array) -> Distance:
-        """See `Revolution.meridian`."""
         return _compute_rod_distances(rho, z, self.flat, self.radius)
 
     def facets(self) -> Facets:
@@ -167,7 +165,6 @@ class Stl(Shape):
 
     @classmethod
     def of(cls, size: Size) -> Self:
-        """See `Shape.of`."""
         if size.surface is None:
             raise ProblemError("an indenter of shape 'stl' needs a surface")
         cls.complete_measures(size.measures or {})
@@ -180,7 +177,6 @@ class Stl(Shape):
         return f"{cls.words} (edge radius {settings.get('edge_radius_mm')} mm)"
 
     def distance(self, points: Array) -> Distance:
-        """See `Shape.distance`."""
         return _compute_surface_distances(points, self.body, self.radius)
 
     def facets(self) -> Facets:

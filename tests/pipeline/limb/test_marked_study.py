@@ -8,8 +8,8 @@ import pytest
 import limbfit
 from limbfit.errors import StudyError
 from limbfit.phantom.geometry import build_rotation, make_limb
-from limbfit.phantom.indentations import build_markers, build_true_sites
 from limbfit.phantom.mri import make_grid, write_series
+from limbfit.phantom.robot import build_markers, build_true_sites
 
 SEED = 3
 TOLERANCE_MM = 1.5  # voxels of 2.4 mm

@@ -7,7 +7,7 @@ from typing import Any
 from ...errors import InputError
 from ...execution import make_executor
 from ...phantom.build import make_phantom, unpack_patient
-from ...phantom.indentations import simulate_true_force
+from ...phantom.robot import simulate_true_force
 from ...study import load_study
 from ..engine.context import Listener, Progress, ignore_progress
 from ..engine.storage import read_json

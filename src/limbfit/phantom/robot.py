@@ -23,21 +23,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from .. import indentation
 from ..anatomy.meshing.meshing import BaseMesh, MeshSettings, build_base_mesh, mesh_site
 from ..anatomy.surfaces.surfaces import Anatomy, load_anatomy
 from ..arrays import Array
 from ..errors import RunError, SiteError
 from ..fe import StepControl, solve
-from ..indentation import (
-    Parameters,
-    SiteModel,
-    build_problem,
-    choose_points_around,
-    cut_neighbourhood,
-    observe_result,
-    place_waves_under,
-    read_indenter,
-)
 from ..mesh import Mesh, find_gauges_along
 from ..study import IndenterTable
 from .geometry import Limb, Shank
@@ -384,7 +375,7 @@ class ForceJob:
     site: TrueSite
     mesh: Mesh
     steps: StepControl
-    parameters: Parameters
+    parameters: indentation.Parameters
     measurements: SecondaryMeasurements = NOTHING
 
 
@@ -417,14 +408,14 @@ def mesh_true_site(site: TrueSite, folder: Path, settings: MeshSettings, within_
     """Mesh one site of the anatomy in ``folder``, and keep the tissue that its force depends on."""
     anatomy, base = _build_base(folder, settings)
     mesh, _ = mesh_site(anatomy, site.position, site.axis, settings, base)
-    return mesh if within_mm is None else cut_neighbourhood(mesh, site.position, within_mm).mesh
+    return mesh if within_mm is None else indentation.cut_neighbourhood(mesh, site.position, within_mm).mesh
 
 
 def simulate_true_force(job: ForceJob) -> TrueForce:
     """Solve one site. Raises `RunError` when the simulation does not complete."""
     site = job.site
     knots_s, knots_mm = site.ramp.knots
-    model = SiteModel(
+    model = indentation.SiteModel(
         name=site.name,
         mesh=Path(),
         mesh_digest="",
@@ -434,7 +425,7 @@ def simulate_true_force(job: ForceJob) -> TrueForce:
         knots_mm=knots_mm,
         indenter=IndenterTable(width_mm=INDENTER_MM, edge_radius_mm=INDENTER_EDGE_MM),
     )
-    problem = replace(build_problem(model, job.mesh, job.parameters), element=ELEMENT)
+    problem = replace(indentation.build_problem(model, job.mesh, job.parameters), element=ELEMENT)
     result = solve(problem, steps=job.steps, store="all" if any(job.measurements) else "peak")
     if not result.completed:
         raise RunError(f"the phantom's site {site.name} could not be simulated: {result.reason}")
@@ -450,12 +441,14 @@ def simulate_true_force(job: ForceJob) -> TrueForce:
     if not any(job.measurements):
         return found
     gauges = find_gauges_along(job.mesh, site.position, site.axis) if job.measurements.ultrasound else ()
-    indenter = read_indenter(model.indenter, model.position, model.axis, model.edge)
-    around = choose_points_around(job.mesh, indenter) if job.measurements.surface else np.zeros((0, 3))
-    waves = place_waves_under(model, job.mesh) if job.measurements.shear_waves else ()
+    indenter = indentation.read_indenter(model.indenter, model.position, model.axis, model.edge)
+    around = np.zeros((0, 3))
+    if job.measurements.surface:
+        around = indentation.choose_points_around(job.mesh, indenter)
+    waves = indentation.place_waves_under(model, job.mesh) if job.measurements.shear_waves else ()
     layers = tuple(gauge.region for gauge in gauges)
     model = replace(model, layers=layers, skin_points=tuple(map(tuple, around)), waves=waves)
-    values, _ = observe_result(result, model, times)
+    values, _ = indentation.observe_result(result, model, times)
     of_layers, of_skin, of_waves = np.split(values, [len(layers), len(values) - len(waves)])
     return replace(
         found,
