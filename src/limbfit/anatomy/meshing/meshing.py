@@ -329,11 +329,9 @@ def _snap_nodes(core: VolumeMesh, fields: LimbFields) -> VolumeMesh:
     target = core.points.copy()
     target[in_plane, 2] = 0.0
     free = np.where(in_plane, 0.0, 1.0)
-    regions = [
-        (REGION << number, regions.build_region_level(fields, number))
-        for number in range(len(fields.regions))
-    ]
-    for surface, level in (*regions, (BONE, fields.void), (LAYER, fields.layer)):
+    numbers = range(len(fields.regions))
+    inner = [(REGION << number, regions.build_region_level(fields, number)) for number in numbers]
+    for surface, level in (*inner, (BONE, fields.void), (LAYER, fields.layer)):
         nodes = np.flatnonzero(_find_nodes_on(core, surface))
         target[nodes] = project_to_level(level, target[nodes], free[nodes])
     points = project_safely(core.points, target, core.tets, GOOD_DIHEDRAL_DEG)
