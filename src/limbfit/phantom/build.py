@@ -355,13 +355,9 @@ def _format_study(patient: _Patient) -> str:
 def make_socket(anatomy: Anatomy, outer: Surface, kind: str = "transtibial") -> tuple[Socket, list[Area]]:
     """Make the socket around a limb in a liner, and its areas: a shank's bears on the patellar tendon.
 
-    Raises `SurfaceError` where the limb has no place for it.
-
-    Parameters
-    ----------
-    anatomy : of the limb; of a shank, with a tibia and a patella.
-    outer : the closed surface of the liner, LPS mm, flat at the same proximal cut.
-    kind : of limb, one of ``LIMBS``.
+    The anatomy of a shank has a tibia and a patella; ``outer`` is the closed surface of the liner, LPS mm,
+    flat at the same proximal cut; ``kind`` is one of ``LIMBS``. Raises `SurfaceError` where the limb has no
+    place for it.
     """
     directions = find_directions(anatomy, "right")
     regions = build_default_regions(anatomy, directions)

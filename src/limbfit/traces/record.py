@@ -182,13 +182,9 @@ def _check_range(
 def read_trace(path: str | Path, columns: tuple[str, str, str] = COLUMNS) -> Trace:
     """Read and check a record; its ``notes`` say what was done to read it.
 
-    Raises `TraceError` with the file, the row or column, and the remedy.
-
-    Parameters
-    ----------
-    path : a text table (comma, semicolon or tab; UTF-8 or UTF-16), ``.lvm``, ``.tdms``, ``.xlsx`` or ``.mat``
-        (version 5).
-    columns : the names of time (s), displacement (mm) and force (N) in it.
+    The file is a text table (comma, semicolon or tab; UTF-8 or UTF-16), ``.lvm``, ``.tdms``, ``.xlsx`` or
+    ``.mat`` (version 5); ``columns`` are the names of time (s), displacement (mm) and force (N) in it. Raises
+    `TraceError` with the file, the row or column, and the remedy.
     """
     with add_location(file=path):
         table = read_table(Path(path), dict(zip(COLUMNS, columns)))

@@ -99,15 +99,11 @@ def regularise(
 ) -> Regularised:
     """The record as smooth curves counted from touch-down.
 
-    Raises `TraceError` where fewer than 8 samples lie between touch-down and the peak, or no smoothing can be
-    chosen, or the way in cannot end where it is stated to.
-
-    Parameters
-    ----------
-    smoothing : penalty on the squared second derivative of force, s^3 (``lam`` of
-        ``scipy.interpolate.make_smoothing_spline`` on the samples as recorded); by default generalised
-        cross-validation chooses it for each phase.
-    peak_s : when the (first) way in ends, as someone states it; found where it is not given.
+    ``smoothing`` is the penalty on the squared second derivative of force, s^3 (``lam`` of
+    ``scipy.interpolate.make_smoothing_spline`` on the samples as recorded); by default generalised
+    cross-validation chooses it for each phase. ``peak_s``: when the (first) way in ends, as someone states
+    it; found where it is not given. Raises `TraceError` where fewer than 8 samples lie between touch-down and
+    the peak, or no smoothing can be chosen, or the way in cannot end where it is stated to.
     """
     line = fit_broken_line(trace.time_s, trace.displacement_mm, peak_s)
     start, end = touch_down.time_s, line.find_return_s(touch_down.displacement_mm)

@@ -62,13 +62,8 @@ def compute_curved_target(mesh: Mesh, fields: LimbFields) -> Array:
 def curve_diagonals(mesh: Mesh, target: Array, stack: Columns) -> Array:
     """Targets (n, 3) where edges within extruded layers follow the curved edges at their foot and head.
 
-    An edge that stayed straight between two curved ones would fold thin elements.
-
-    Parameters
-    ----------
-    mesh : tet10, straight-sided.
-    target : (n, 3) for the mid-edge nodes of the layers' innermost and outermost faces.
-    stack : the layers' columns.
+    An edge that stayed straight between two curved ones would fold thin elements. The mesh is tet10 and
+    straight-sided; ``target`` (n, 3) is for the mid-edge nodes of the layers' innermost and outermost faces.
     """
     corners = int(mesh.cells[:, :4].max()) + 1
     ends = np.zeros((len(mesh.points) - corners, 2), dtype=np.int64)

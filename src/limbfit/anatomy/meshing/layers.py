@@ -270,16 +270,8 @@ def build_liner_surface(
 ) -> tuple[Anatomy, Array | None]:
     """The anatomy whose outer surface is a liner's, everywhere ``thickness_mm`` outside the skin.
 
-    Parameters
-    ----------
-    anatomy : closed skin and bones, LPS mm.
-    thickness_mm : of the liner; meshed as the outermost layer, it leaves the skin where it was.
-    fat_depth_mm : (n,) depth of the fat's inner face below the vertices of the skin.
-
-    Returns
-    -------
-    anatomy : with the liner's outer surface for its skin.
-    fat_depth_mm : (m,) depth of the fat's inner face below the vertices of that surface.
+    Meshed as the outermost layer, the liner leaves the skin where it was. ``fat_depth_mm`` (n,) is the depth
+    of the fat's inner face below the vertices of the skin; also return it below those of the outer surface.
     """
     frame = anatomy.frame
     skin = Surface(frame.to_limb(anatomy.skin.points), anatomy.skin.faces)

@@ -327,7 +327,6 @@ def read_surface(
 
     Parameters
     ----------
-    path : the file.
     coordinates : what the file holds; by default what it says itself, as those of 3D Slicer do, else LPS.
     unit : of the file: mm, cm, m or inch.
     key : of the study that says the coordinates, for the error's text.
