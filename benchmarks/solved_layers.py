@@ -25,8 +25,7 @@ from limbfit.fe import History, Indenter, Material, OgdenQLV, Problem, Result, S
 from limbfit.mesh import Mesh
 from limbfit.mesh.cells import HEX, build_boxes
 from limbfit.shapes import Measure, register_shape
-from limbfit.shapes.builtin import Square
-from limbfit.shapes.shape import Distance
+from limbfit.shapes.shape import Distance, Square
 
 Array = NDArray[np.float64]
 

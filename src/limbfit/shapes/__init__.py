@@ -6,8 +6,8 @@ docs/extending.md.
 
 from ..errors import InputError
 from ..extensions import Registry
-from .builtin import Cylinder, Sphere, Square, Stl
 from .shape import SHARP_EDGE as SHARP_EDGE
+from .shape import Cylinder, Sphere, Square, Stl
 from .shape import Facets as Facets
 from .shape import Measure as Measure
 from .shape import Revolution as Revolution
