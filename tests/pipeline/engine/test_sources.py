@@ -101,6 +101,6 @@ def test_a_changed_file_changes_what_it_decides_and_nothing_else(tmp_path):
         return {stage for stage, value in digests().items() if value != before[stage]}
 
     assert changed_by("report/templates/report.css", "/* */\n") == {"report", "cube"}
-    meshed = changed_by("anatomy/meshing/smoothing.py", "\n# a remark\n")
+    meshed = changed_by("anatomy/meshing/improving.py", "\n# a remark\n")
     assert "mesh" in meshed
     assert not meshed & {"segment", "surfaces", "sites", "traces", "calibrate", "predict", "report"}

@@ -9,7 +9,7 @@ The recipe
 3. Nodes of layer, bones and regions are put on their smooth surfaces; the skin layer is extruded from the
    interface to the skin, each node to its nearest skin point: its thickness is uniform by construction.
 4. Quadratic elements: promoted straight-sided, then curved to the smooth surfaces where they stay sound;
-   faces that are too coarse to follow a bone are put on it in the mean (`curving`).
+   faces that are too coarse to follow a bone are put on it in the mean (`improving`).
 """
 
 import time
@@ -26,9 +26,8 @@ from ...errors import MeshingError, ProblemError
 from ...mesh import Mesh, boundary_faces, check, node_jacobians, to_tet10
 from ...results.limb import BoneLoss, MeshMeasures
 from ..surfaces.surfaces import Anatomy
-from . import background, regions, smoothing
+from . import background, improving, regions
 from .background import BONE, LAYER, PLANE, REGION, TetGrid, compute_volumes, project_safely, project_to_level
-from .curving import balance_bone_faces, compute_curved_target, curve_diagonals, curve_mesh
 from .engines import ENGINES, MesherError, VolumeMesh, VolumeTask
 from .extrusion import build_core_mesh, extrude_layers
 from .layers import BonePolicy, LayerSpec, LimbFields, build_limb_fields, evaluate_distance
@@ -219,20 +218,20 @@ def _mesh_base(
     try:
         core = ENGINES[settings.engine](task, settings.time_limit_s)
     except MesherError as error:  # as a rule where its input is flattest
-        where = smoothing.describe_narrowest_gap(task.points, task.tets, fields)
+        where = improving.describe_narrowest_gap(task.points, task.tets, fields)
         raise MeshingError(f"{error}; its input is flattest {where}") from None
     core = _snap_nodes(core, fields)
     names = (*(layer.name for layer in settings.layers), *fields.regions, settings.core)
     mesh, stack = extrude_layers(core, fields, names)
-    mesh = smoothing.smooth_elements(mesh, fields, stack)
-    mesh, repairs = smoothing.repair_mesh(mesh, fields, stack)
-    if settings.element == "tet10" and not smoothing.find_inverted_cells(mesh).any():
+    mesh = improving.smooth_elements(mesh, fields, stack)
+    mesh, repairs = improving.repair_mesh(mesh, fields, stack)
+    if settings.element == "tet10" and not improving.find_inverted_cells(mesh).any():
         mesh = to_tet10(mesh)
         if settings.curved:
             straight = node_jacobians(mesh).min(axis=1)
-            target = curve_diagonals(mesh, compute_curved_target(mesh, fields), stack)
-            mesh = curve_mesh(mesh, target, straight)
-            mesh = balance_bone_faces(mesh, fields, straight)
+            target = improving.curve_diagonals(mesh, improving.compute_curved_target(mesh, fields), stack)
+            mesh = improving.curve_mesh(mesh, target, straight)
+            mesh = improving.balance_bone_faces(mesh, fields, straight)
     _check_usable(mesh, fields)
     measures = measure_mesh(
         mesh,
@@ -250,8 +249,8 @@ def _mesh_base(
 
 
 def _check_usable(mesh: Mesh, fields: LimbFields) -> None:
-    if smoothing.find_inverted_cells(mesh).any():
-        where = smoothing.describe_unrepaired(mesh, fields)
+    if improving.find_inverted_cells(mesh).any():
+        where = improving.describe_unrepaired(mesh, fields)
         raise MeshingError(f"{where}; smooth the surface there, or choose smaller edges")
     try:
         check(mesh)
@@ -352,7 +351,7 @@ def _recover_interface(points: Array, target: Array, core: VolumeMesh, fields: L
     inner[core.triangles] = False
     moved = points.copy()
     moved[stray] = target[stray]
-    moved = smoothing.untangle_cells(moved, core.tets, np.zeros_like(moved), inner)
+    moved = improving.untangle_cells(moved, core.tets, np.zeros_like(moved), inner)
     return moved if (compute_volumes(moved, core.tets) > 0.0).all() else points
 
 
