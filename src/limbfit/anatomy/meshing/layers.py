@@ -124,11 +124,8 @@ class LimbFields:
             value[candidates[nearer]], gradient[candidates[nearer]] = distance[nearer], slope[nearer]
         return value, gradient
 
-    def measure_trimmed_bones(self) -> dict[str, BoneLoss]:
-        """What trimming took from each bone."""
-        return {name: self._measure_trimmed_bone(bone) for name, bone in self.bones.items()}
-
-    def _measure_trimmed_bone(self, bone: Surface) -> BoneLoss:
+    def measure_trimmed_bone(self, bone: Surface) -> BoneLoss:
+        """What trimming took from a bone."""
         below = bone.points[bone.points[:, 2] <= 0.0]
         excess = self.bone_clearance_mm - self.layer(below)[0] if len(below) else np.zeros(0)
         shallow = below[excess > 0]

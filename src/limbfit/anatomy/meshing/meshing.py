@@ -124,7 +124,7 @@ def build_base_mesh(anatomy: Anatomy, settings: MeshSettings, fat_depth_mm: Arra
         if not len(grid.tets):
             raise MeshingError(f"no {settings.core} is left under the layers; choose thinner layers")
     grid = regions.cut_at_regions(grid, fields)
-    trimmed = fields.measure_trimmed_bones()
+    trimmed = {name: fields.measure_trimmed_bone(bone) for name, bone in fields.bones.items()}
     limit = compute_size_limit(fields, grid, settings)
     enclosed = compute_enclosed_volume(anatomy, fields, trimmed)
     return BaseMesh(fields, grid, limit, trimmed, enclosed, regions.compute_region_volumes(fields))
