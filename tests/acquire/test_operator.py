@@ -1,6 +1,6 @@
 """The key that is held, as a terminal tells of it."""
 
-from limbfit.acquire.events import Abort, Signal
+from limbfit.acquire.protocol import Abort, Signal
 from limbfit.acquire.session import Keyboard
 
 

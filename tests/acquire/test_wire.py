@@ -7,10 +7,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from in_process import Bench, connect, device, session_in
 
-from limbfit.acquire.events import PINS, Sample
 from limbfit.acquire.line_protocol import (
     DEVICE_LINE,
     HOST_LINE,
+    PINS,
     Accepted,
     Bye,
     Declined,
@@ -26,6 +26,7 @@ from limbfit.acquire.line_protocol import (
     NotePhase,
     NoteSite,
     OutOfReach,
+    Sample,
     SetLimits,
     Stop,
     derive_salt,

@@ -10,7 +10,7 @@ them together.
 """
 
 from .device import DEFAULT_ADDRESS, DEFAULT_PORT, LineDevice, connect
-from .events import Event, Settings
+from .protocol import Event, Settings
 from .recording import (
     RecordedRamp,
     Recorder,

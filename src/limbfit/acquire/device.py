@@ -16,7 +16,6 @@ from typing import Any, ClassVar
 
 from ..errors import InputError, RunError
 from . import line_protocol as wire
-from .events import PINS, RATE_HZ
 
 DEFAULT_PORT = 7714
 DEFAULT_ADDRESS = f"tcp://127.0.0.1:{DEFAULT_PORT}"
@@ -272,6 +271,6 @@ def _check_identity(identity: wire.Identity) -> None:
             f"the device speaks version {identity.version} of the protocol, limbfit {wire.VERSION}; "
             "see docs/device-protocol.md"
         )
-    if (identity.pins, identity.rate_hz) != (PINS, RATE_HZ):
+    if (identity.pins, identity.rate_hz) != (wire.PINS, wire.RATE_HZ):
         found = f"{identity.pins} pins at {identity.rate_hz} Hz"
-        raise RunError(f"the device has {found}; limbfit knows {PINS} at {RATE_HZ} Hz")
+        raise RunError(f"the device has {found}; limbfit knows {wire.PINS} at {wire.RATE_HZ} Hz")

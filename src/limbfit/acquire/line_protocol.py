@@ -14,10 +14,12 @@ Each message is a type. A body that is not exactly one of these is no message: `
 import re
 from binascii import crc32
 from dataclasses import dataclass, field
+from enum import IntFlag
 from typing import Annotated, Any, ClassVar, dataclass_transform, get_args, get_origin, get_type_hints
 
-from .events import PINS, Sample
-
+PINS = 14
+RATE_HZ = 500
+PERIOD_US = 1_000_000 // RATE_HZ
 VERSION = 1
 HOST_LINE = 128  # bytes, newline included: the longest that a device must take
 DEVICE_LINE = 768  # the longest that limbfit takes
@@ -38,6 +40,41 @@ PinBits = Annotated[int, range(1 << PINS)]  # a bit for each
 Word = Annotated[str, re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,39}\Z", re.ASCII)]
 Nonce = Annotated[str, re.compile(r"[0-9a-f]{16}\Z")]
 Clock = Annotated[str, re.compile(r"(real|paced)\Z")]
+
+
+class Flags(IntFlag):
+    """State bits of a sample, as the device sets them."""
+
+    STOPPED = 1  # a stop is latched: no pin moves towards the limb
+    BUTTON = 2  # the device's own emergency stop is pressed
+    NO_POWER = 4  # the actuators have no power
+    HOME = 8  # every pin is home
+    GIVEN_UP = 16  # a stop is latched, and some pins do not come home
+
+
+@dataclass(frozen=True, slots=True)
+class Sample:
+    """One sample of all channels.
+
+    ``moving`` has bit k set while pin k + 1 is being driven; the tuples are by pin.  ``number`` is the number
+    of the line in which the device sent it.
+    """
+
+    number: int
+    time_us: int
+    flags: int
+    moving: int
+    position_um: tuple[int, ...]
+    force_mN: tuple[int, ...]
+    capacitance_fF: tuple[int, ...]
+
+    def is_moving(self, pin: int) -> bool:
+        return bool(self.moving >> (pin - 1) & 1)
+
+
+def to_thousandths(value: float) -> int:
+    """mm as um, N as mN, s as ms: a thousandth."""
+    return round(1000 * value)
 
 
 def derive_salt(host_nonce: str, device_nonce: str) -> int:

@@ -32,7 +32,7 @@ import numpy as np
 from ..arrays import Indices
 from ..errors import RunError, TraceError, add_location
 from ..traces import Regularised, Trace, find_touch_down, regularise
-from .events import PERIOD_US, PINS, Sample
+from .line_protocol import PERIOD_US, PINS, Sample
 
 FIRST_LINE = "#limbfit-recording 1"
 ROWS_PER_BLOCK = 25  # per block: 50 ms
@@ -117,7 +117,7 @@ class Recorder:
 
 @dataclass(frozen=True)
 class Recording:
-    """A record that was read: one row per sample; (n,) or (n, 14) integers in the units of `events`.
+    """A record that was read: one row per sample; (n,) or (n, 14) integers in the units of `line_protocol`.
 
     ``lost_bytes`` stand after the last block that is whole.
     """

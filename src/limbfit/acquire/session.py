@@ -18,8 +18,8 @@ from typing import Any
 from ..errors import RunError
 from . import line_protocol as wire
 from .device import LineDevice
-from .events import PERIOD_US, Abort, Event, LinkLost, Sample, Settings, Signal, to_thousandths
-from .protocol import Phase, Protocol
+from .line_protocol import PERIOD_US, Sample, to_thousandths
+from .protocol import Abort, Event, LinkLost, Phase, Protocol, Settings, Signal
 from .recording import Recorder
 
 SAMPLES_PER_LIVE_UPDATE = 20  # the listener gets 25 updates a second

@@ -33,7 +33,7 @@ from ..acquire import (
     Update,
     prioritise,
 )
-from ..acquire.events import Abort
+from ..acquire.protocol import Abort
 from ..acquire.virtual import Serving, read_faults
 from ..errors import InputError
 from .commands import StudyPath

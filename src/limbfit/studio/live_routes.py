@@ -11,7 +11,7 @@ from fastapi import APIRouter, Query
 from pydantic import BaseModel, ValidationError
 
 from ..acquire import Recording, follow_recording
-from ..acquire.events import PINS
+from ..acquire.line_protocol import PINS
 from ..acquire.protocol import FINAL
 from ..acquire.recording import Check
 from ..errors import TraceError

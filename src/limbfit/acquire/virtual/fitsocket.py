@@ -16,7 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from ...errors import InputError
 from .. import line_protocol as wire
-from ..events import PINS, RATE_HZ, Flags, Sample
+from ..line_protocol import PINS, RATE_HZ, Flags, Sample
 from ..safety import FROZEN_S, FROZEN_SAMPLES, Guard, SafetyLimits
 from .parts import STROKE_MM, Motors, Sensors, VirtualLimb
 

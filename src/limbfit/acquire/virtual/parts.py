@@ -18,7 +18,7 @@ from scipy.optimize import nnls
 
 from ...arrays import Array, Mask
 from ...errors import TraceError
-from ..events import PINS
+from ..line_protocol import PINS
 
 STEP_S = 0.001  # of time
 GAP_MM = (12.0, 22.0)  # from a pin's home to the skin

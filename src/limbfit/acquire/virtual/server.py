@@ -13,7 +13,7 @@ from typing import Any
 
 from ...errors import InputError, RunError
 from ..device import Link, TcpLink
-from ..events import PERIOD_US
+from ..line_protocol import PERIOD_US
 from .fitsocket import STEPS_PER_SAMPLE, VirtualFitSocket
 
 MAX_LEAD_US = 4 * PERIOD_US  # how far a paced device runs ahead of what its host has dealt with
