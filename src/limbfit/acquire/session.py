@@ -27,8 +27,6 @@ PACED_SILENCE_S = 20.0  # wall time, where the device's clock waits for limbfit'
 LOOP_TIMEOUT_S = 0.002
 FIRST_SAMPLE_S = 1.0  # the first sample may take longer than those after it
 CLOCK_DRIFT_S = 1e-6  # per sample: two clocks may run apart by 500 ppm without making samples look late
-
-
 # What the words of a device mean; it may have others.
 _CODE_MEANINGS = {
     "watchdog": "it heard from limbfit too late: check the wire, and what else runs on this machine",

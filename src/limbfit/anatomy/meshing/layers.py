@@ -39,9 +39,10 @@ NORMAL_WITHIN_MM = 1e-3  # of a surface, where its normal stands for the gradien
 TRIM_SAMPLES = 60_000
 MIN_LAYER_SHARE = 1 / 3  # of the layers' thickness, below which ``thin-skin`` trims bone instead
 
-BonePolicy = Literal["trim-bone", "thin-skin"]
 LINER_SPACING_MM = 3.0  # of the grid on which the surface is contoured
 LINER_EDGE_MM = 4.0  # of its triangles
+
+BonePolicy = Literal["trim-bone", "thin-skin"]
 
 
 @dataclass(frozen=True)
