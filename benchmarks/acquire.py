@@ -37,21 +37,25 @@ from limbfit.acquire import (
     read_recording,
     run_session,
 )
-from limbfit.acquire.events import PINS, Abort, Event, Flags, Sample, Stop
 from limbfit.acquire.line_protocol import (
     HOST_LINE,
+    PINS,
     Accepted,
     Bye,
     Decoder,
     Encoder,
+    Flags,
     Heartbeat,
     Hello,
     Identity,
+    Sample,
     SetLimits,
+    Stop,
     derive_salt,
     format_sample,
     parse_command,
 )
+from limbfit.acquire.protocol import Abort, Event
 from limbfit.acquire.session import prioritise
 
 SITE = "bench"

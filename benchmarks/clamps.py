@@ -21,7 +21,7 @@ from limbfit.indentation import build_materials
 from limbfit.indentation.sites import clamp_problem
 from limbfit.mesh import Mesh
 from limbfit.phantom import TrueSite, build_true_sites, draw_true_parameters, make_limb
-from limbfit.phantom.surfaces import build_true_anatomy
+from limbfit.phantom.geometry import build_true_anatomy
 from limbfit.study import ClampsTable
 
 SEED, INDENTER_MM, EDGE_MM, KAPPA_RATIO = 0, 20.0, 2.0, 100.0

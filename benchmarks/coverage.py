@@ -39,7 +39,7 @@ from limbfit.identify.fit.objective import MeasuredCurve, SiteResponse
 from limbfit.identify.fit.parameters import Unknowns
 from limbfit.identify.uncertainty.emulator import Emulator
 from limbfit.identify.uncertainty.noise import SiteNoise, compute_depth_slope, estimate_record_noise
-from limbfit.phantom.record import DISPLACEMENT_NOISE_MM, RATE_HZ
+from limbfit.phantom.robot import DISPLACEMENT_NOISE_MM, RATE_HZ
 from limbfit.pipeline.engine.context import Context
 from limbfit.pipeline.engine.store import Store, read_json
 from limbfit.pipeline.identification.search import build_unknowns

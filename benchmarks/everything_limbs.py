@@ -34,10 +34,9 @@ from limbfit.bench.meshing import (
     make_amputated_calf,
 )
 from limbfit.phantom.build import draw_true_parameters
-from limbfit.phantom.geometry import make_limb
+from limbfit.phantom.geometry import extract_contour, make_limb
 from limbfit.phantom.mri import build_true_labels, make_grid
-from limbfit.phantom.record import Ramp, record
-from limbfit.phantom.surfaces import extract_contour
+from limbfit.phantom.robot import Ramp, record
 
 Array = NDArray[np.floating]
 

@@ -20,8 +20,8 @@ from limbfit.anatomy.surfaces.surfaces import Anatomy, save_anatomy
 from limbfit.fe import StepControl, solve
 from limbfit.indentation import Parameters, SiteModel, build_problem
 from limbfit.phantom.build import draw_true_parameters
-from limbfit.phantom.record import HEADER, Ramp, record
-from limbfit.phantom.surfaces import extract_contour
+from limbfit.phantom.geometry import extract_contour
+from limbfit.phantom.robot import HEADER, Ramp, record
 from limbfit.study import IndenterTable
 
 Array = NDArray[np.float64]

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from limbfit.mesh import TET10_EDGES, Mesh, boundary_faces, node_jacobians, to_tet10
-from limbfit.mesh.boxes import SIX_TETS
+from limbfit.mesh.cells import SIX_TETS
 
 FINE_MM = 3.5  # longest interval under the indenter: what limbfit's mesher makes there by default
 Array = NDArray[np.float64]

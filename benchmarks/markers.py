@@ -23,14 +23,13 @@ from numpy.typing import NDArray
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 from limbfit.anatomy.imaging import LabelMap, Volume
-from limbfit.anatomy.sites.marked import extract_marked_skin, remove_markers
-from limbfit.anatomy.sites.markers import Marker, find_markers, match_markers
-from limbfit.anatomy.sites.registration import register_limb
+from limbfit.anatomy.sites.marked import extract_marked_skin, register_limb, remove_markers
+from limbfit.anatomy.sites.sites import Marker, find_markers, match_markers
 from limbfit.anatomy.surfaces.surfaces import Surface, build_anatomy
 from limbfit.errors import SiteError
 from limbfit.phantom.geometry import Limb, build_rotation, make_limb
 from limbfit.phantom.mri import ScanGrid, make_grid
-from limbfit.phantom.sites import TrueSite, build_markers, build_true_sites
+from limbfit.phantom.robot import TrueSite, build_markers, build_true_sites
 from scanned import build_image
 
 SHIFT_MM, TURN_DEG = 5.0, 3.0

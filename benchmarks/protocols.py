@@ -39,7 +39,7 @@ from limbfit.identify.checks.design import (
 )
 from limbfit.identify.fit.objective import SiteResponse
 from limbfit.indentation import to_vector
-from limbfit.phantom.record import NOTHING, ULTRASOUND_NOISE_MM, WAVES_NOISE_M_S, SecondaryMeasurements
+from limbfit.phantom.robot import NOTHING, ULTRASOUND_NOISE_MM, WAVES_NOISE_M_S, SecondaryMeasurements
 from limbfit.pipeline.design.protocol import DETERMINED
 from limbfit.pipeline.engine.context import Context
 from limbfit.pipeline.engine.store import Store, read_json

@@ -33,7 +33,7 @@ from limbfit.indentation import (
     read_indenter,
 )
 from limbfit.mesh import Mesh, find_gauges_along, read_vtu, write_vtu
-from limbfit.phantom.record import (
+from limbfit.phantom.robot import (
     CLEARANCE_MM,
     DISPLACEMENT_NOISE_MM,
     NOTHING,

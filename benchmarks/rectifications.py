@@ -30,8 +30,7 @@ from limbfit.anatomy.surfaces.surfaces import Surface, write_surface
 from limbfit.errors import InputError, RunError
 from limbfit.execution import SerialExecutor
 from limbfit.mesh import Mesh
-from limbfit.phantom.geometry import make_limb
-from limbfit.phantom.surfaces import build_true_anatomy
+from limbfit.phantom.geometry import build_true_anatomy, make_limb
 from limbfit.pipeline.commands.planning import choose_tissues
 from limbfit.pipeline.engine.context import Context, ignore_progress
 from limbfit.pipeline.engine.store import Store

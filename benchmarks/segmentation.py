@@ -26,13 +26,12 @@ import SimpleITK as sitk  # noqa: N813
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 from limbfit.anatomy.grid import BONES, FAT, LabelMap
-from limbfit.anatomy.labels.quality import assess_labels
+from limbfit.anatomy.labels.labelcheck import assess_labels
 from limbfit.anatomy.segmentation.body import check_one_limb
 from limbfit.anatomy.segmentation.segmentation import segment
 from limbfit.anatomy.surfaces.surfaces import Anatomy, build_anatomy
-from limbfit.phantom.geometry import Limb, compute_gradient, make_limb
+from limbfit.phantom.geometry import Limb, build_true_anatomy, compute_gradient, make_limb
 from limbfit.phantom.mri import CONTRASTS, DETAIL_GRIDS, ScanGrid, make_grid
-from limbfit.phantom.surfaces import build_true_anatomy
 from scanned import build_image
 
 BELOW_CUT_MM = 3.0

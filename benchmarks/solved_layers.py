@@ -23,10 +23,9 @@ from scipy.stats import qmc
 
 from limbfit.fe import History, Indenter, Material, OgdenQLV, Problem, Result, StepControl, Support, solve
 from limbfit.mesh import Mesh
-from limbfit.mesh.boxes import HEX, build_boxes
+from limbfit.mesh.cells import HEX, build_boxes
 from limbfit.shapes import Measure, register_shape
-from limbfit.shapes.builtin import Square
-from limbfit.shapes.shape import Distance
+from limbfit.shapes.shape import Distance, Square
 
 Array = NDArray[np.float64]
 

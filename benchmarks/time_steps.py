@@ -18,8 +18,13 @@ from material_point import compute_curve_error, solve_layer, solve_reference_lay
 from limbfit.fe import History, StepControl, solve
 from limbfit.indentation import SiteModel, build_problem
 from limbfit.mesh import read_vtu
-from limbfit.phantom.forces import LOAD_STEPS, STIFFEST_PER_MM, UNLOAD_STEPS
-from limbfit.phantom.sites import INDENTER_EDGE_MM, INDENTER_MM
+from limbfit.phantom.robot import (
+    INDENTER_EDGE_MM,
+    INDENTER_MM,
+    LOAD_STEPS,
+    STIFFEST_PER_MM,
+    UNLOAD_STEPS,
+)
 from limbfit.study import IndenterTable
 
 T = 10.0  # s, one way

@@ -44,7 +44,7 @@ from limbfit.identify.fit.prediction import PredictionModel
 from limbfit.indentation import SimulationJob, SiteModel, simulate
 from limbfit.laws import to_vector
 from limbfit.mesh import write_vtu
-from limbfit.phantom.record import Ramp, record
+from limbfit.phantom.robot import Ramp, record
 from limbfit.pipeline.engine.context import Context
 from limbfit.pipeline.engine.store import COARSE, Store, write_json
 from limbfit.pipeline.identification.calibrate import run_calibrate

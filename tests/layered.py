@@ -13,8 +13,8 @@ from limbfit.bench.timing import build_block_model
 from limbfit.execution import SerialExecutor
 from limbfit.indentation import Parameters, SimulationJob, SiteModel, simulate
 from limbfit.mesh import Mesh, boundary_faces, to_tet10, write_vtu
-from limbfit.mesh.boxes import SIX_TETS, build_boxes
-from limbfit.phantom.record import Ramp, record
+from limbfit.mesh.cells import SIX_TETS, build_boxes
+from limbfit.phantom.robot import Ramp, record
 from limbfit.pipeline.engine.context import Context
 from limbfit.pipeline.engine.store import COARSE, Store, write_json
 from limbfit.pipeline.records.traces import run_traces

@@ -10,11 +10,11 @@ import numpy as np
 
 from acquiring import indentation
 from limbfit.acquire.device import LineDevice
-from limbfit.acquire.events import PINS, Settings, Signal
-from limbfit.acquire.protocol import Phase
+from limbfit.acquire.line_protocol import PINS
+from limbfit.acquire.protocol import Phase, Settings, Signal
 from limbfit.acquire.session import Session
 from limbfit.acquire.virtual import Fault, VirtualFitSocket, VirtualLimb, fit_surrogate
-from limbfit.acquire.virtual.pins import BRAKING
+from limbfit.acquire.virtual.parts import BRAKING
 
 FAST = {
     "clamp_speed_mm_s": 8.0,

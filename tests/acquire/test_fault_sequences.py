@@ -21,8 +21,8 @@ from hypothesis.stateful import (
 )
 from in_process import Bench
 
-from limbfit.acquire.events import PINS, Abort, LinkLost, Signal
-from limbfit.acquire.protocol import Phase
+from limbfit.acquire.line_protocol import PINS
+from limbfit.acquire.protocol import Abort, LinkLost, Phase, Signal
 from limbfit.acquire.virtual import FAULT_KINDS, Fault
 
 WAY = [

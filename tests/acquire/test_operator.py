@@ -1,7 +1,7 @@
 """The key that is held, as a terminal tells of it."""
 
-from limbfit.acquire.events import Abort, Signal
-from limbfit.acquire.operator import Keyboard
+from limbfit.acquire.protocol import Abort, Signal
+from limbfit.acquire.session import Keyboard
 
 
 def test_a_touch_of_the_key_moves_nothing() -> None:

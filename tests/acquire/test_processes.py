@@ -25,9 +25,8 @@ from in_process import settings
 import limbfit
 from acquiring import SPEED, fitsocket, start
 from limbfit.acquire import LineDevice, LiveUpdate, Session, connect, read_recording, run_session
-from limbfit.acquire.events import Abort, Flags, Sample, Signal
-from limbfit.acquire.line_protocol import Encoder, SetLimits
-from limbfit.acquire.protocol import Phase
+from limbfit.acquire.line_protocol import Encoder, Flags, Sample, SetLimits
+from limbfit.acquire.protocol import Abort, Phase, Signal
 from limbfit.acquire.virtual import Fault, Serving, read_faults
 from limbfit.errors import RunError
 from limbfit.pipeline.records.traces import read_record

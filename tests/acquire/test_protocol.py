@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 from in_process import FAST, Bench, session_in, settings
 
-from limbfit.acquire.events import Abort, Sample, Signal
-from limbfit.acquire.operator import NoOperator
-from limbfit.acquire.protocol import FINAL, TRANSITIONS, Phase
+from limbfit.acquire.line_protocol import Sample
+from limbfit.acquire.protocol import FINAL, TRANSITIONS, Abort, Phase, Signal
 from limbfit.acquire.safety import Guard, make_session_limits
-from limbfit.acquire.session import PhaseUpdate
+from limbfit.acquire.session import NoOperator, PhaseUpdate
 from limbfit.acquire.virtual import Fault
 
 

@@ -11,9 +11,8 @@ from in_process import Bench
 
 from limbfit import check_recording, load_study
 from limbfit.acquire import Recorder, check_record, find_ramps, follow_recording, read_recording
-from limbfit.acquire.events import PINS, Sample
-from limbfit.acquire.quality import RecordedRamp
-from limbfit.acquire.recording import COLUMNS
+from limbfit.acquire.line_protocol import PINS, Sample
+from limbfit.acquire.recording import COLUMNS, RecordedRamp
 from limbfit.errors import InputError, TraceError
 from limbfit.pipeline.commands.acquire import write_ramp
 from limbfit.traces import COLUMNS as TRACE_COLUMNS

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from in_process import SURROGATE, device, indentation
 
 from limbfit.acquire.virtual import Surrogate, VirtualLimb, fit_surrogate
-from limbfit.acquire.virtual.limb import TAUS_S, _integrate_memory, _split_depth
+from limbfit.acquire.virtual.parts import TAUS_S, _integrate_memory, _split_depth
 from limbfit.errors import TraceError
 
 

@@ -7,23 +7,28 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from in_process import Bench, connect, device, session_in
 
-from limbfit.acquire.events import PINS, Fence, Hold, Move, Sample, Stop
 from limbfit.acquire.line_protocol import (
     DEVICE_LINE,
     HOST_LINE,
+    PINS,
     Accepted,
     Bye,
     Declined,
     Decoder,
     Encoder,
+    Fence,
     Heartbeat,
     Hello,
+    Hold,
     Identity,
     LimitTripped,
+    Move,
     NotePhase,
     NoteSite,
     OutOfReach,
+    Sample,
     SetLimits,
+    Stop,
     derive_salt,
     format_sample,
     parse_command,

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from limbs import DIRECTIONS, leg_image
 
-from limbfit.anatomy.labels.contours import (
+from limbfit.anatomy.labels.labelfiles import (
     fill_even_odd,
     find_outlines,
     read_contours,

@@ -9,7 +9,7 @@ from test_labels import labels_on
 
 from limbfit.anatomy.grid import SOFT_TISSUE
 from limbfit.anatomy.imaging import LabelMap, read_labels
-from limbfit.anatomy.labels.contours import fill_even_odd
+from limbfit.anatomy.labels.labelfiles import fill_even_odd
 from limbfit.errors import LabelError
 
 RANDOM = np.random.default_rng(3)

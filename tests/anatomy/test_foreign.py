@@ -10,18 +10,18 @@ import pytest
 from bodies import limb
 from limbs import SHARED, rotation
 
-from limbfit.anatomy.meshing import meshing, untangling
+from limbfit.anatomy.meshing import improving, meshing
 from limbfit.anatomy.meshing.background import compute_volumes
 from limbfit.anatomy.meshing.engines import ENGINES, VolumeMesh, run_mmg
 from limbfit.anatomy.meshing.extrusion import extrude_layers
-from limbfit.anatomy.meshing.layers import LimbFields
-from limbfit.anatomy.meshing.meshing import MeshSettings, build_base_mesh, mesh_site
-from limbfit.anatomy.meshing.smoothing import find_constraints
-from limbfit.anatomy.meshing.untangling import (
+from limbfit.anatomy.meshing.improving import (
+    find_constraints,
     find_inverted_cells,
     repair_mesh,
     thin_inverted_layers,
 )
+from limbfit.anatomy.meshing.layers import LimbFields
+from limbfit.anatomy.meshing.meshing import MeshSettings, build_base_mesh, mesh_site
 from limbfit.anatomy.sites.sites import compute_indenter_axis, project_to_skin
 from limbfit.errors import MeshingError
 from limbfit.mesh import check, measure_quality
@@ -71,7 +71,7 @@ def spoiled(monkeypatch, core):
 
         monkeypatch.setitem(ENGINES, "mmg", lambda *task: core)
         monkeypatch.setattr(meshing, "extrude_layers", layers)
-        monkeypatch.setattr(meshing, "smooth_elements", lambda mesh, fields, stack: mesh)
+        monkeypatch.setattr(improving, "smooth_elements", lambda mesh, fields, stack: mesh)
 
     return apply
 
@@ -125,7 +125,7 @@ def test_inverted_cells_are_mended_and_told(spoiled, anatomy, base, site, where)
 
 def test_what_cannot_be_mended_is_refused_with_its_place(monkeypatch, spoiled, anatomy, base, site):
     spoiled(lambda mesh, stack: through(mesh, inner_node(mesh, stack)))
-    monkeypatch.setattr(untangling, "SWEEPS", 0)
+    monkeypatch.setattr(improving, "UNTANGLING_SWEEPS", 0)
     told = (
         r"\d+ of \d+ cells are inverted, the first in muscle at \(.*\) mm, .* mm from .*: there is too little"
     )
@@ -151,7 +151,7 @@ def test_a_sound_mesh_is_left_alone_and_thinner_layers_alone_make_crossed_column
         return after, repairs
 
     monkeypatch.setitem(ENGINES, "mmg", lambda *task: core)
-    monkeypatch.setattr(meshing, "repair_mesh", watched)
+    monkeypatch.setattr(improving, "repair_mesh", watched)
     _, report = mesh_site(anatomy, *site, COARSE, base)
     ((mesh, after, stack),) = given
     assert report.repairs == ()

@@ -5,8 +5,12 @@ import pytest
 from bodies import limb
 from limbs import rotation
 
-from limbfit.anatomy.meshing.layers import LayerSpec, build_limb_fields, evaluate_distance
-from limbfit.anatomy.meshing.liner import build_liner_surface
+from limbfit.anatomy.meshing.layers import (
+    LayerSpec,
+    build_limb_fields,
+    build_liner_surface,
+    evaluate_distance,
+)
 from limbfit.anatomy.meshing.meshing import MeshSettings, mesh_limb
 from limbfit.anatomy.surfaces.surfaces import Anatomy
 from limbfit.anatomy.surfaces.triangles import check_closed

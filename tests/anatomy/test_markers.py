@@ -8,15 +8,14 @@ import pytest
 
 from limbfit.anatomy.grid import LabelMap, Volume
 from limbfit.anatomy.segmentation.body import find_limb_mask, smooth_image
-from limbfit.anatomy.sites.marked import extract_marked_skin, outline_height, remove_markers
-from limbfit.anatomy.sites.markers import Marker, find_bumps, find_markers, match_markers
-from limbfit.anatomy.sites.registration import register_limb
+from limbfit.anatomy.sites.marked import extract_marked_skin, outline_height, register_limb, remove_markers
+from limbfit.anatomy.sites.sites import Marker, find_bumps, find_markers, match_markers
 from limbfit.anatomy.surfaces.surfaces import extract_surface
 from limbfit.anatomy.surfaces.triangles import Surface
 from limbfit.errors import ImageError, SiteError
 from limbfit.phantom.geometry import build_rotation, make_limb
 from limbfit.phantom.mri import make_grid
-from limbfit.phantom.sites import build_markers, build_true_sites
+from limbfit.phantom.robot import build_markers, build_true_sites
 from scanned import build_image
 
 SHIFT_MM, TURN_DEG = np.array([3.0, -2.5, 2.5]), 2.8

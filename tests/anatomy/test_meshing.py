@@ -12,8 +12,8 @@ from bodies import limb
 from limbs import SHARED, rotation
 
 from limbfit.anatomy.meshing import engines
-from limbfit.anatomy.meshing.curving import curve_diagonals
 from limbfit.anatomy.meshing.extrusion import build_columns
+from limbfit.anatomy.meshing.improving import curve_diagonals
 from limbfit.anatomy.meshing.layers import LayerSpec, evaluate_distance
 from limbfit.anatomy.meshing.meshing import BaseMesh, MeshSettings, build_base_mesh, mesh_site
 from limbfit.anatomy.meshing.meshreport import check_quality

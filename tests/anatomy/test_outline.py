@@ -10,9 +10,14 @@ from limbs import write_dicom
 from limbfit.anatomy.grid import BONES, FAT, Volume
 from limbfit.anatomy.imaging import read_volume
 from limbfit.anatomy.morphology import compute_depth
-from limbfit.anatomy.segmentation.body import find_limb_mask, remove_supports, smooth_image
-from limbfit.anatomy.segmentation.ct import is_ct
-from limbfit.anatomy.segmentation.fat import find_bright_fat, select_subcutaneous
+from limbfit.anatomy.segmentation.body import (
+    find_bright_fat,
+    find_limb_mask,
+    is_ct,
+    remove_supports,
+    select_subcutaneous,
+    smooth_image,
+)
 from limbfit.anatomy.segmentation.segmentation import segment
 from limbfit.errors import ImageError
 from limbfit.phantom.geometry import SKIN_AND_FAT, Limb, make_limb

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import pyvista as pv
 
-from limbfit.anatomy.meshing.smoothing import OPPOSITE, compute_worst_angles
+from limbfit.anatomy.meshing.improving import OPPOSITE, compute_worst_angles
 from limbfit.anatomy.surfaces.triangles import Surface, from_pyvista
 from limbfit.mesh import compute_dihedral_angles
 

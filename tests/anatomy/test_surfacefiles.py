@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 import pyvista as pv
 
-from limbfit.anatomy.surfaces.surfacefiles import UNITS_MM, read_surface
-from limbfit.anatomy.surfaces.triangles import check_closed
+from limbfit.anatomy.surfaces.triangles import UNITS_MM, check_closed, read_surface
 from limbfit.errors import SurfaceError
 
 

@@ -27,7 +27,7 @@ from limbfit.fe.motion import Drives
 from limbfit.fe.solution.linear import multiply_symmetric
 from limbfit.fe.system import Evaluation, Increment
 from limbfit.mesh import TET10_EDGES, TET_FACES, Mesh
-from limbfit.mesh.boxes import HEX, SIX_TETS, build_boxes
+from limbfit.mesh.cells import HEX, SIX_TETS, build_boxes
 from tetrahedra import turn_upright
 
 HEX_FACES = np.array([[0, 3, 2, 1], [4, 5, 6, 7], [0, 1, 5, 4], [1, 2, 6, 5], [2, 3, 7, 6], [3, 0, 4, 7]])

@@ -11,7 +11,7 @@ from limbfit.errors import ProblemError
 from limbfit.fe import StepControl, System, solve
 from limbfit.indentation import build_clamping_pins, clamp_problem
 from limbfit.mesh import Mesh
-from limbfit.mesh.boxes import SIX_TETS, build_boxes
+from limbfit.mesh.cells import SIX_TETS, build_boxes
 from limbfit.study import ClampsTable
 from tetrahedra import turn_upright
 

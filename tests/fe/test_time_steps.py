@@ -11,7 +11,7 @@ from blocks import FINE_Z, punch
 from limbfit.fe import History, StepControl, solve
 from limbfit.fe.materials import compute_prony_factors
 from limbfit.fe.solution.control import grade_steps, predict_remaining_times
-from limbfit.phantom.forces import DISCRETISATIONS
+from limbfit.phantom.robot import DISCRETISATIONS
 from limbfit.study import SolverTable
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))

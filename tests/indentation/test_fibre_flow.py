@@ -9,7 +9,7 @@ from limbfit.errors import ProblemError
 from limbfit.indentation import build_fibre_field, cut_neighbourhood
 from limbfit.indentation.sites import compute_flow_directions
 from limbfit.mesh import Mesh
-from limbfit.mesh.boxes import HEX, SIX_TETS, build_boxes
+from limbfit.mesh.cells import HEX, SIX_TETS, build_boxes
 from tetrahedra import turn_upright
 
 

@@ -10,9 +10,9 @@ from functools import partial
 import numpy as np
 import pytest
 
-from limbfit.phantom import build, socket
-from limbfit.phantom.forces import TrueForce, simulate_true_force
+from limbfit.phantom import geometry
 from limbfit.phantom.mri import DETAIL_GRIDS
+from limbfit.phantom.robot import TrueForce, simulate_true_force
 
 SPACING_MM = 8.0  # of the grids on which surfaces are contoured
 VOXELS = ((44, 30, 30), (5.9, 5.8, 6.0))
@@ -23,8 +23,12 @@ def few_voxels() -> Iterator[None]:
     """What `make_phantom` makes meanwhile covers the same limb with voxels and triangles of 6 to 8 mm."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(DETAIL_GRIDS, "coarse", VOXELS)
-        patch.setattr(build, "build_true_anatomy", partial(build.build_true_anatomy, spacing=SPACING_MM))
-        patch.setattr(socket, "build_outer_surface", partial(socket.build_outer_surface, spacing=SPACING_MM))
+        patch.setattr(
+            geometry, "build_true_anatomy", partial(geometry.build_true_anatomy, spacing=SPACING_MM)
+        )
+        patch.setattr(
+            geometry, "build_outer_surface", partial(geometry.build_outer_surface, spacing=SPACING_MM)
+        )
         yield
 
 

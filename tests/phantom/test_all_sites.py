@@ -8,11 +8,16 @@ import pytest
 from layered import layered_block
 from limbfit.anatomy.surfaces.surfaces import save_anatomy
 from limbfit.phantom.build import draw_true_parameters
-from limbfit.phantom.forces import DISCRETISATIONS, ForceJob, mesh_true_site, simulate_true_force
-from limbfit.phantom.geometry import make_limb
-from limbfit.phantom.record import SecondaryMeasurements
-from limbfit.phantom.sites import TrueSite, build_true_sites
-from limbfit.phantom.surfaces import build_true_anatomy
+from limbfit.phantom.geometry import build_true_anatomy, make_limb
+from limbfit.phantom.robot import (
+    DISCRETISATIONS,
+    ForceJob,
+    SecondaryMeasurements,
+    TrueSite,
+    build_true_sites,
+    mesh_true_site,
+    simulate_true_force,
+)
 from small_limb import limb
 
 NAMES = [f"{number:02d}" for number in range(1, 19)]

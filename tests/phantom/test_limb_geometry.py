@@ -9,9 +9,15 @@ from scipy.spatial import cKDTree
 
 from limbfit.anatomy.grid import BONES
 from limbfit.anatomy.surfaces.surfaces import check_closed
-from limbfit.phantom.geometry import Limb, build_rotation, make_limb
-from limbfit.phantom.sites import DETAIL_SITES, FITTED, SAFE_SHARE, TrueSite, build_true_sites, select_sites
-from limbfit.phantom.surfaces import build_true_anatomy
+from limbfit.phantom.geometry import Limb, build_rotation, build_true_anatomy, make_limb
+from limbfit.phantom.robot import (
+    DETAIL_SITES,
+    FITTED,
+    SAFE_SHARE,
+    TrueSite,
+    build_true_sites,
+    select_sites,
+)
 
 SEEDS = (0, 1, 2, 3)
 SPACING_MM = 3.0  # of the points at which fields are asked

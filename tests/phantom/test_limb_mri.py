@@ -22,7 +22,7 @@ from limbfit.phantom.mri import (
     make_grid,
     write_series,
 )
-from limbfit.phantom.sites import build_markers, build_true_sites
+from limbfit.phantom.robot import build_markers, build_true_sites
 
 
 @pytest.fixture(scope="module")

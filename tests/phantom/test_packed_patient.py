@@ -11,8 +11,7 @@ from limbfit.anatomy.surfaces.surfaces import load_anatomy
 from limbfit.errors import InputError
 from limbfit.phantom import build_true_sites, draw_true_parameters, make_limb, make_phantom, unpack_patient
 from limbfit.phantom.build import _format_study, _Patient
-from limbfit.phantom.record import SecondaryMeasurements
-from limbfit.phantom.sites import DETAIL_SITES, select_sites
+from limbfit.phantom.robot import DETAIL_SITES, SecondaryMeasurements, select_sites
 
 ANEW = (
     "limbfit phantom patient && (cd patient && python -m zipfile -c ../src/limbfit/phantom/patient.zip "

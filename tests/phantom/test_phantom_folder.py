@@ -17,10 +17,9 @@ from limbfit.anatomy.surfaces.surfaces import load_anatomy
 from limbfit.errors import InputError, SiteError
 from limbfit.laws import LAWS
 from limbfit.phantom import draw_true_parameters, make_limb, make_phantom
-from limbfit.phantom.forces import simulate_true_force
+from limbfit.phantom.geometry import build_true_anatomy
 from limbfit.phantom.mri import DETAIL_GRIDS, build_true_labels, make_grid
-from limbfit.phantom.sites import DETAIL_SITES, FITTED
-from limbfit.phantom.surfaces import build_true_anatomy
+from limbfit.phantom.robot import DETAIL_SITES, FITTED, simulate_true_force
 from limbfit.study import load_study
 from limbfit.traces import read_surface_motion
 

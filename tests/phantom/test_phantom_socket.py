@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from small_phantoms import cubic_law
 
-from limbfit.anatomy.frame import build_limb_frame
+from limbfit.anatomy.grid import build_limb_frame
 from limbfit.anatomy.surfaces.surfaces import load_anatomy, write_surface
 from limbfit.phantom import make_limb, make_phantom
-from limbfit.phantom.socket import LINER_MM, make_socket
-from limbfit.phantom.surfaces import build_outer_surface, build_true_anatomy
+from limbfit.phantom.build import LINER_MM, make_socket
+from limbfit.phantom.geometry import build_outer_surface, build_true_anatomy
 from limbfit.pipeline.socket.shape import build_socket
 from limbfit.socket import read_socket
 from limbfit.study import load_study

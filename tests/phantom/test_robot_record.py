@@ -5,8 +5,15 @@ import pytest
 
 from limbfit.errors import SiteError
 from limbfit.phantom.geometry import make_limb
-from limbfit.phantom.record import CLEARANCE_MM, FORCE_NOISE_N, Ramp, record
-from limbfit.phantom.sites import SPEED_MM_S, SPEED_SPREAD, build_true_sites
+from limbfit.phantom.robot import (
+    CLEARANCE_MM,
+    FORCE_NOISE_N,
+    SPEED_MM_S,
+    SPEED_SPREAD,
+    Ramp,
+    build_true_sites,
+    record,
+)
 
 RAMP = Ramp(depth=5.0, speed=0.96)
 

@@ -15,11 +15,10 @@ from limbfit.anatomy.segmentation.segmentation import segment
 from limbfit.anatomy.surfaces.surfaces import Anatomy, Surface
 from limbfit.errors import InputError, StudyError
 from limbfit.phantom import Limb, build_true_sites, make_limb, make_phantom
-from limbfit.phantom.forces import choose_discretisation
+from limbfit.phantom.build import LINER_MM, Area, make_socket
+from limbfit.phantom.geometry import build_outer_surface, build_true_anatomy
 from limbfit.phantom.mri import LABELS_FILE, build_true_labels, make_grid
-from limbfit.phantom.sites import DETAIL_SITES, SAFE_SHARE
-from limbfit.phantom.socket import LINER_MM, Area, make_socket
-from limbfit.phantom.surfaces import build_outer_surface, build_true_anatomy
+from limbfit.phantom.robot import DETAIL_SITES, SAFE_SHARE, choose_discretisation
 from limbfit.pipeline.commands.check import check_study
 from limbfit.pipeline.socket.shape import build_regions, load_of
 from limbfit.socket import Socket

@@ -15,7 +15,7 @@ from population_fit import fit
 from solved_layers import C_MPA, LOADS_N, ROUNDING_MM, Rectangle, SolvedDesign, SolvedFootprint, press_layers
 from test_population import TRUE, made
 
-from limbfit.shapes.builtin import Square
+from limbfit.shapes.shape import Square
 
 
 def test_small_compressions_are_those_of_linear_theory(monkeypatch: pytest.MonkeyPatch) -> None:

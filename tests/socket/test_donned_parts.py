@@ -13,7 +13,7 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parents[1] / "anatomy"))
 from bodies import limb
 
-from limbfit.anatomy.frame import build_limb_frame
+from limbfit.anatomy.grid import build_limb_frame
 from limbfit.anatomy.meshing.layers import LayerSpec
 from limbfit.anatomy.meshing.meshing import MeshSettings, mesh_limb
 from limbfit.donning import Load, SocketFit, build_socket_problem, pack, simulate_donning, unpack

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from socket_limbs import CUT_NORMAL, measure_circumference, round_limb
 
-from limbfit.anatomy.frame import build_limb_frame
+from limbfit.anatomy.grid import build_limb_frame
 from limbfit.anatomy.surfaces.triangles import Surface
 from limbfit.errors import SurfaceError
 from limbfit.socket import Recipe, Zone, rectify_limb

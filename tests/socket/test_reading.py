@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 from socket_limbs import CUT_NORMAL, round_limb
 
-from limbfit.anatomy.frame import build_limb_frame
-from limbfit.anatomy.surfaces.surfacefiles import write_surface
-from limbfit.anatomy.surfaces.triangles import Surface
+from limbfit.anatomy.grid import build_limb_frame
+from limbfit.anatomy.surfaces.triangles import Surface, write_surface
 from limbfit.errors import SurfaceError
 from limbfit.socket import Recipe, Socket, read_socket, rectify_limb
 from limbfit.socket.shape import close_by_fans

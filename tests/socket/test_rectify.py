@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from socket_limbs import CUT_NORMAL, FILES, TOP, measure_circumference, real_limb, revolved, round_limb
 
-from limbfit.anatomy.frame import Frame, build_limb_frame
+from limbfit.anatomy.grid import Frame, build_limb_frame
 from limbfit.anatomy.surfaces.surfaces import Anatomy
 from limbfit.anatomy.surfaces.triangles import Surface
 from limbfit.errors import SurfaceError

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from limbfit.anatomy.frame import build_limb_frame
+from limbfit.anatomy.grid import build_limb_frame
 from limbfit.anatomy.surfaces.surfaces import write_surface
 from limbfit.anatomy.surfaces.triangles import Surface, remove_unused_points
 from limbfit.socket import Recipe, rectify_limb

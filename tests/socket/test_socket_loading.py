@@ -12,7 +12,7 @@ from bodies import limb
 from limbfit.donning import Load, LoadedState, SocketFit, Strains, build_socket_steps
 from limbfit.identify.checks.domain import ANGLE, LEVEL, PRESSURE, RATE, SHEAR, TIME, Extent, RecordedRange
 from limbfit.mesh import Mesh, boundary_faces, cell_volumes
-from limbfit.mesh.boxes import SIX_TETS, build_boxes
+from limbfit.mesh.cells import SIX_TETS, build_boxes
 from limbfit.pipeline.simulation.loading import LimbAxis, LoadHistory, describe_socket_load
 from tetrahedra import turn_upright
 

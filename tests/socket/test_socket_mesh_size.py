@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from socket_limbs import CUT_NORMAL, round_limb
 
-from limbfit.anatomy.frame import build_limb_frame
+from limbfit.anatomy.grid import build_limb_frame
 from limbfit.pipeline.socket.shape import mesh_edge_mm
 from limbfit.socket import Recipe, Socket, rectify_limb
 from limbfit.socket.trim import Trim

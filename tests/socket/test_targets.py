@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from socket_limbs import CUT_NORMAL, round_limb
 
-from limbfit.anatomy.frame import build_limb_frame
+from limbfit.anatomy.grid import build_limb_frame
 from limbfit.errors import SurfaceError
 from limbfit.socket import Recipe, rectify_limb
 from limbfit.socket.landmarks import build_default_regions, find_directions

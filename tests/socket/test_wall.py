@@ -9,9 +9,8 @@ import pytest
 import trimesh
 from socket_limbs import CUT_NORMAL, FILES, real_limb, round_limb
 
-from limbfit.anatomy.frame import build_limb_frame
-from limbfit.anatomy.surfaces.surfacefiles import write_surface
-from limbfit.anatomy.surfaces.triangles import Surface
+from limbfit.anatomy.grid import build_limb_frame
+from limbfit.anatomy.surfaces.triangles import Surface, write_surface
 from limbfit.errors import SurfaceError
 from limbfit.socket import Area, Recipe, Socket, rectify_limb
 from limbfit.socket.landmarks import find_knee_centre

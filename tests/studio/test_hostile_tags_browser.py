@@ -11,7 +11,7 @@ from conftest import write_trace
 from limbfit import study_status
 from limbfit.phantom.geometry import make_limb
 from limbfit.phantom.mri import make_grid, write_series
-from limbfit.phantom.sites import build_true_sites
+from limbfit.phantom.robot import build_true_sites
 from limbfit.study import load_study
 
 ATTACKS = (

@@ -9,7 +9,7 @@ import pytest
 from fastapi.testclient import TestClient
 
 from limbfit.acquire import Recorder
-from limbfit.acquire.events import PINS, Sample
+from limbfit.acquire.line_protocol import PINS, Sample
 from limbfit.acquire.recording import FOLLOWED_BYTES
 from limbfit.studio.folder import StudyFolder
 from limbfit.studio.guard import AccessGuard

@@ -10,8 +10,25 @@ them together.
 """
 
 from .device import DEFAULT_ADDRESS, DEFAULT_PORT, LineDevice, connect
-from .events import Event, Settings
-from .operator import Keyboard, NoOperator
-from .quality import RecordedRamp, Verdict, check_record, find_ramps
-from .recording import Recorder, Recording, follow_recording, read_recording
-from .session import Listener, LiveUpdate, PhaseUpdate, Session, Update, prioritise, run_session
+from .protocol import Event, Settings
+from .recording import (
+    RecordedRamp,
+    Recorder,
+    Recording,
+    Verdict,
+    check_record,
+    find_ramps,
+    follow_recording,
+    read_recording,
+)
+from .session import (
+    Keyboard,
+    Listener,
+    LiveUpdate,
+    NoOperator,
+    PhaseUpdate,
+    Session,
+    Update,
+    prioritise,
+    run_session,
+)

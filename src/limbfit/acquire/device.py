@@ -16,7 +16,6 @@ from typing import Any, ClassVar
 
 from ..errors import InputError, RunError
 from . import line_protocol as wire
-from .events import PINS, RATE_HZ, Hold, Move, Stop
 
 DEFAULT_PORT = 7714
 DEFAULT_ADDRESS = f"tcp://127.0.0.1:{DEFAULT_PORT}"
@@ -167,13 +166,8 @@ class LineDevice:
     """A device that speaks the line protocol (docs/device-protocol.md); times are s of the caller's clock.
 
     A command that the device does not answer is sent again under a new number; one that is replaced by a
-    newer one for the same pin is not.
-
-    Raises
-    ------
-    RunError
-        Where nobody answers, or it is another version, has other pins or another rate than limbfit knows;
-        from each of its methods, where the device is gone.
+    newer one for the same pin is not. Raises `RunError` where nobody answers, or it is another version, has
+    other pins or another rate than limbfit knows; from each of its methods, where the device is gone.
     """
 
     def __init__(self, link: Link) -> None:
@@ -222,11 +216,11 @@ class LineDevice:
     def send(self, command: wire.Command, now: float) -> None:
         """Give a command; one that needs an answer is remembered until it comes."""
         match command:  # what a newer command makes void: the older ones for its pin; a stop, all
-            case Stop():
+            case wire.Stop():
                 self._pending.clear()
-            case Move(pin=pin) | Hold(pin=pin):
+            case wire.Move(pin=pin) | wire.Hold(pin=pin):
                 for older, waiting in list(self._pending.items()):
-                    if isinstance(waiting.command, (Move, Hold)) and waiting.command.pin == pin:
+                    if isinstance(waiting.command, (wire.Move, wire.Hold)) and waiting.command.pin == pin:
                         del self._pending[older]
         self._write(command, now, attempts=1)
 
@@ -261,7 +255,7 @@ class LineDevice:
             if now < waiting.due:
                 continue
             del self._pending[number]
-            if waiting.attempts >= MAX_ATTEMPTS and not isinstance(waiting.command, Stop):
+            if waiting.attempts >= MAX_ATTEMPTS and not isinstance(waiting.command, wire.Stop):
                 reason = "the device does not answer commands"
             else:
                 self._write(waiting.command, now, waiting.attempts + 1)
@@ -277,6 +271,6 @@ def _check_identity(identity: wire.Identity) -> None:
             f"the device speaks version {identity.version} of the protocol, limbfit {wire.VERSION}; "
             "see docs/device-protocol.md"
         )
-    if (identity.pins, identity.rate_hz) != (PINS, RATE_HZ):
+    if (identity.pins, identity.rate_hz) != (wire.PINS, wire.RATE_HZ):
         found = f"{identity.pins} pins at {identity.rate_hz} Hz"
-        raise RunError(f"the device has {found}; limbfit knows {PINS} at {RATE_HZ} Hz")
+        raise RunError(f"the device has {found}; limbfit knows {wire.PINS} at {wire.RATE_HZ} Hz")

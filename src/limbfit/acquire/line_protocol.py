@@ -14,10 +14,12 @@ Each message is a type. A body that is not exactly one of these is no message: `
 import re
 from binascii import crc32
 from dataclasses import dataclass, field
-from typing import Annotated, Any, get_args
+from enum import IntFlag
+from typing import Annotated, Any, ClassVar, dataclass_transform, get_args, get_origin, get_type_hints
 
-from .events import PINS, Fence, Hold, Message, Move, Pin, Positive, Sample, Stop
-
+PINS = 14
+RATE_HZ = 500
+PERIOD_US = 1_000_000 // RATE_HZ
 VERSION = 1
 HOST_LINE = 128  # bytes, newline included: the longest that a device must take
 DEVICE_LINE = 768  # the longest that limbfit takes
@@ -27,13 +29,52 @@ _INTEGER = re.compile(r"[0-9]{1,9}\Z", re.ASCII)
 _SAMPLE = re.compile(
     rf"S ([0-9]{{1,15}}),([0-9]{{1,4}}),([0-9]{{1,5}})((?:,-?[0-9]{{1,8}}){{{3 * PINS}}})\Z", re.ASCII
 )
-# Further types of words.
+MAX_VALUE = 1_000_000  # no length, speed or force of this device is larger (um, um/s, mN)
+# Types of the words of messages, with the values that have a meaning.
+Pin = Annotated[int, range(1, PINS + 1)]
+Whole = Annotated[int, range(MAX_VALUE + 1)]
+Positive = Annotated[int, range(1, MAX_VALUE + 1)]
 Number = Annotated[int, range(MAX_NUMBER + 1)]  # of a line: may be larger than any length, speed or force
 PinOrNone = Annotated[int, range(PINS + 1)]  # 0: none
 PinBits = Annotated[int, range(1 << PINS)]  # a bit for each
 Word = Annotated[str, re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,39}\Z", re.ASCII)]
 Nonce = Annotated[str, re.compile(r"[0-9a-f]{16}\Z")]
 Clock = Annotated[str, re.compile(r"(real|paced)\Z")]
+
+
+class Flags(IntFlag):
+    """State bits of a sample, as the device sets them."""
+
+    STOPPED = 1  # a stop is latched: no pin moves towards the limb
+    BUTTON = 2  # the device's own emergency stop is pressed
+    NO_POWER = 4  # the actuators have no power
+    HOME = 8  # every pin is home
+    GIVEN_UP = 16  # a stop is latched, and some pins do not come home
+
+
+@dataclass(frozen=True, slots=True)
+class Sample:
+    """One sample of all channels.
+
+    ``moving`` has bit k set while pin k + 1 is being driven; the tuples are by pin.  ``number`` is the number
+    of the line in which the device sent it.
+    """
+
+    number: int
+    time_us: int
+    flags: int
+    moving: int
+    position_um: tuple[int, ...]
+    force_mN: tuple[int, ...]
+    capacitance_fF: tuple[int, ...]
+
+    def is_moving(self, pin: int) -> bool:
+        return bool(self.moving >> (pin - 1) & 1)
+
+
+def to_thousandths(value: float) -> int:
+    """mm as um, N as mN, s as ms: a thousandth."""
+    return round(1000 * value)
 
 
 def derive_salt(host_nonce: str, device_nonce: str) -> int:
@@ -146,6 +187,28 @@ class Decoder:
         return Line(count, body.decode("ascii"))
 
 
+@dataclass_transform(frozen_default=True)
+class Message:
+    """What a line of the wire says: a verb and its words.
+
+    ``words`` are the fields of a kind whose type says what values they have, in their order, and these
+    values: a range, or a pattern.
+    """
+
+    verb: ClassVar[str]
+    words: ClassVar[dict[str, Any]]
+
+    def __init_subclass__(cls, verb: str) -> None:
+        types = get_type_hints(cls, include_extras=True)
+        cls.verb = verb
+        cls.words = {name: of.__metadata__[0] for name, of in types.items() if get_origin(of) is Annotated}
+        dataclass(frozen=True)(cls)
+
+    @property
+    def body(self) -> str:
+        return " ".join((self.verb, *(str(getattr(self, name)) for name in self.words)))
+
+
 # -- from limbfit to the device
 
 
@@ -187,6 +250,37 @@ class Heartbeat(Message, verb="BEAT"):
 
 class Bye(Message, verb="BYE"):
     """Ends the session."""
+
+
+class Move(Message, verb="MOVE"):
+    """Drive a pin (1 to 14) to a position; it halts by itself at a force (0: at none)."""
+
+    pin: Pin
+    target_um: Whole
+    speed_um_s: Positive
+    halt_mN: Whole = 0
+
+
+class Hold(Message, verb="HOLD"):
+    """Halt a pin where it is."""
+
+    pin: Pin
+
+
+class Stop(Message, verb="STOP"):
+    """Halt everything at once, then bring every pin home; stays until the session ends.
+
+    The reason holds what devices said, and stays off the wire.
+    """
+
+    reason: str = ""
+
+
+class Fence(Message, verb="FENCE"):
+    """From now on a pin may not go beyond a position."""
+
+    pin: Pin
+    position_um: Positive
 
 
 # -- from the device to limbfit
@@ -242,7 +336,8 @@ class OutOfReach(Message, verb="STUCK"):
     pins: PinBits
 
 
-Command = Hello | SetLimits | NoteSite | NotePhase | Heartbeat | Bye | Move | Hold | Stop | Fence
+Action = Move | Hold | Stop | Fence
+Command = Hello | SetLimits | NoteSite | NotePhase | Heartbeat | Bye | Action
 Notice = Sample | Declined | LimitTripped | OutOfReach  # what concerns a session
 Report = Identity | Accepted | Notice
 _COMMANDS: dict[str, Any] = {kind.verb: kind for kind in get_args(Command)}

@@ -5,25 +5,12 @@ Events come in and actions go out; there is no clock, no wire and no file. One `
 be done. `TRANSITIONS` alone says where a session can go.
 """
 
-from enum import StrEnum
+from dataclasses import dataclass
+from enum import Enum, StrEnum
 
-from .events import (
-    RATE_HZ,
-    Abort,
-    Action,
-    Event,
-    Fence,
-    Flags,
-    Hold,
-    LinkLost,
-    Move,
-    Sample,
-    Settings,
-    Signal,
-    Stop,
-    to_thousandths,
-)
-from .line_protocol import Identity
+from ..study import AcquireTable
+from . import line_protocol as wire
+from .line_protocol import PINS, RATE_HZ, Flags, Sample, to_thousandths
 from .safety import ClampWatch, Guard, check_device_flags, check_sensitivity, make_session_limits
 
 COMMAND_DELAY_S = 0.05  # a pin may stand still for so long before a command reaches it
@@ -31,6 +18,47 @@ ARRIVAL_TOLERANCE_UM = 60  # a pin that is so near to its target has arrived
 MAX_CLAMP_ROUNDS = 30
 MAX_SILENCE_S = 5.0  # a device that says nothing for so long after a stop is out of reach
 MAX_STOP_S = 15.0  # and so is one that has not come home by then
+
+
+class Signal(Enum):
+    """What happens besides samples and ends."""
+
+    BEGIN = "the operator starts the session"
+    CONFIRM = "the operator says that the limb is in place, the test pin at its site"
+    KEY_DOWN = "the operator holds the key of the depth search"
+    KEY_UP = "the operator lets it go"
+    TICK = "time passes without a sample"
+
+
+@dataclass(frozen=True, slots=True)
+class Abort:
+    """Somebody or something ends the session: a key, a signal, a limit, the watchdog."""
+
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class LinkLost:
+    """Nothing will come from the device any more."""
+
+    reason: str
+
+
+Event = Sample | Signal | Abort | LinkLost
+
+
+class Settings(AcquireTable):
+    """The study's table ``[acquire]``, and which pins hold the limb."""
+
+    @property
+    def withdrawn(self) -> tuple[int, ...]:
+        """The two neighbours of the test pin, which stay off the skin so that it can bulge."""
+        return tuple((self.pin - 1 + step) % PINS + 1 for step in (-1, 1))
+
+    @property
+    def clamps(self) -> tuple[int, ...]:
+        """The pins that hold the limb."""
+        return tuple(pin for pin in range(1, PINS + 1) if pin != self.pin and pin not in self.withdrawn)
 
 
 class Phase(StrEnum):
@@ -106,7 +134,7 @@ class Protocol:
     cycle : ramps begun so far, those of preconditioning included.
     """
 
-    def __init__(self, settings: Settings, device: Identity) -> None:
+    def __init__(self, settings: Settings, device: wire.Identity) -> None:
         self.settings, self.device = settings, device
         self.phase, self.reason = Phase.IDLE, ""
         self.touch_um = self.start_um = self.depth_um = self.cycle = 0
@@ -126,13 +154,8 @@ class Protocol:
     def is_completed(self) -> bool:
         return self.phase is Phase.DONE
 
-    def handle(self, event: Event, now: float) -> tuple[Action, ...]:
-        """Return the actions that an event leads to.
-
-        Parameters
-        ----------
-        now : s, never less than in the call before.
-        """
+    def handle(self, event: Event, now: float) -> tuple[wire.Action, ...]:
+        """Return the actions that an event leads to; ``now``: s, never less than in the call before."""
         if isinstance(event, Sample):
             self._last_sample_s = now
             return self._handle_sample(event, now)
@@ -158,12 +181,12 @@ class Protocol:
                 return self._transition(Phase.SEARCH, now)
             case Signal.KEY_UP if self.phase is Phase.SEARCH:
                 self._is_confirmed = False
-                return (Hold(self.settings.pin),)
+                return (wire.Hold(self.settings.pin),)
         return self._check_time(now)
 
     # -- whatever the phase
 
-    def _handle_sample(self, sample: Sample, now: float) -> tuple[Action, ...]:
+    def _handle_sample(self, sample: Sample, now: float) -> tuple[wire.Action, ...]:
         if self.phase in FINAL or self.phase is Phase.IDLE:
             return ()
         if self.phase is not Phase.STOPPING:
@@ -187,7 +210,7 @@ class Protocol:
             return ""
         return check_sensitivity(travel, force_mN, to_thousandths(self.settings.touch_N) // 2, pin)
 
-    def _check_time(self, now: float) -> tuple[Action, ...]:
+    def _check_time(self, now: float) -> tuple[wire.Action, ...]:
         """Stop, or give up, where a phase takes longer than it may."""
         if self.phase in FINAL or self.phase is Phase.IDLE:
             return ()
@@ -205,13 +228,13 @@ class Protocol:
             return self._stop(f"{self.phase} took longer than {limit:g} s", now)
         return ()
 
-    def _stop(self, reason: str, now: float) -> tuple[Action, ...]:
+    def _stop(self, reason: str, now: float) -> tuple[wire.Action, ...]:
         if Phase.STOPPING not in TRANSITIONS.get(self.phase, ()):
             return ()
         self.reason = reason
         return self._transition(Phase.STOPPING, now)
 
-    def _transition(self, phase: Phase, now: float) -> tuple[Action, ...]:
+    def _transition(self, phase: Phase, now: float) -> tuple[wire.Action, ...]:
         if phase not in TRANSITIONS[self.phase]:
             raise ValueError(f"no session goes from {self.phase} to {phase}")
         self.phase = phase
@@ -220,13 +243,13 @@ class Protocol:
 
     # -- moves
 
-    def _drive(self, target_um: int, speed_mm_s: float, halt_mN: int = 0) -> tuple[Action, ...]:
-        return (Move(self.settings.pin, target_um, to_thousandths(speed_mm_s), halt_mN),)
+    def _drive(self, target_um: int, speed_mm_s: float, halt_mN: int = 0) -> tuple[wire.Action, ...]:
+        return (wire.Move(self.settings.pin, target_um, to_thousandths(speed_mm_s), halt_mN),)
 
-    def _drive_home(self, pins: tuple[int, ...]) -> tuple[Action, ...]:
-        return tuple(Move(pin, 0, to_thousandths(self.settings.retract_speed_mm_s)) for pin in pins)
+    def _drive_home(self, pins: tuple[int, ...]) -> tuple[wire.Action, ...]:
+        return tuple(wire.Move(pin, 0, to_thousandths(self.settings.retract_speed_mm_s)) for pin in pins)
 
-    def _enter(self) -> tuple[Action, ...]:
+    def _enter(self) -> tuple[wire.Action, ...]:
         """Return the actions with which a phase begins."""
         settings, stroke_um = self.settings, self.device.stroke_um
         match self.phase:
@@ -237,13 +260,13 @@ class Protocol:
                 self._rounds += 1
                 speed = to_thousandths(settings.clamp_speed_mm_s / (1 if self._rounds == 1 else 5))
                 halt = to_thousandths(settings.clamp_N)
-                return tuple(Move(pin, stroke_um, speed, halt) for pin in settings.clamps)
+                return tuple(wire.Move(pin, stroke_um, speed, halt) for pin in settings.clamps)
             case Phase.APPROACH:
                 self._contact_um = None
                 halt = self._compute_tare() + to_thousandths(settings.touch_N)
                 return self._drive(stroke_um, settings.approach_speed_mm_s, max(halt, 1))
             case Phase.BACK | Phase.RETURN:
-                fence = Fence(settings.pin, self._compute_deepest_um())
+                fence = wire.Fence(settings.pin, self._compute_deepest_um())
                 return (fence, *self._drive(self.start_um, settings.retract_speed_mm_s))
             case Phase.SEARCH:
                 self._is_confirmed, self.depth_um = True, 0
@@ -260,7 +283,7 @@ class Protocol:
             case Phase.RELEASE:
                 return self._drive_home(settings.clamps)
             case Phase.STOPPING:
-                return (Stop(self.reason),)
+                return (wire.Stop(self.reason),)
         return ()
 
     # -- how phases end

@@ -7,7 +7,8 @@ moved in the clamps, that a sensor does not answer to a push, that a step takes 
 from collections import deque
 from dataclasses import dataclass, replace
 
-from .events import PINS, Flags, Sample, Settings, to_thousandths
+from ..study import AcquireTable
+from .line_protocol import PINS, Flags, Sample, to_thousandths
 
 FROZEN_S = 0.010  # a sensor whose last digit has not changed for so long, and so many samples, is dead
 FROZEN_SAMPLES = 8
@@ -43,7 +44,7 @@ class Violation:
     text: str
 
 
-def make_session_limits(settings: Settings, stroke_um: int, range_mN: int, rate_hz: int) -> SafetyLimits:
+def make_session_limits(settings: AcquireTable, stroke_um: int, range_mN: int, rate_hz: int) -> SafetyLimits:
     """The limits of a session before the skin has been met; see `Guard.set_depth`."""
     force = [to_thousandths(settings.clamp_limit_N)] * PINS
     force[settings.pin - 1] = to_thousandths(settings.force_limit_N)

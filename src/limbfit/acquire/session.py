@@ -1,4 +1,4 @@
-"""One session: the protocol, the watchdog, the record and whoever watches, around a device.
+"""One session: the protocol, the watchdog, the record, the operator and whoever watches, around a device.
 
 `Session` reads no clock and waits for nothing: `run_session` does, in one tight loop.  The beat that it sends
 after each sample tells the device which sample has been dealt with, so that the device can judge the whole
@@ -18,21 +18,8 @@ from typing import Any
 from ..errors import RunError
 from . import line_protocol as wire
 from .device import LineDevice
-from .events import (
-    PERIOD_US,
-    Abort,
-    Action,
-    Event,
-    Hold,
-    LinkLost,
-    Move,
-    Sample,
-    Settings,
-    Signal,
-    Stop,
-    to_thousandths,
-)
-from .protocol import Phase, Protocol
+from .line_protocol import PERIOD_US, Sample, to_thousandths
+from .protocol import Abort, Event, LinkLost, Phase, Protocol, Settings, Signal
 from .recording import Recorder
 
 SAMPLES_PER_LIVE_UPDATE = 20  # the listener gets 25 updates a second
@@ -40,8 +27,6 @@ PACED_SILENCE_S = 20.0  # wall time, where the device's clock waits for limbfit'
 LOOP_TIMEOUT_S = 0.002
 FIRST_SAMPLE_S = 1.0  # the first sample may take longer than those after it
 CLOCK_DRIFT_S = 1e-6  # per sample: two clocks may run apart by 500 ppm without making samples look late
-
-
 # What the words of a device mean; it may have others.
 _CODE_MEANINGS = {
     "watchdog": "it heard from limbfit too late: check the wire, and what else runs on this machine",
@@ -57,6 +42,7 @@ _CODE_MEANINGS = {
     "armed": "it has a session",
     "unknown-site": "it has no such site",
 }
+FIRST_REPEAT_S = 0.75  # a keyboard waits before a held key repeats
 
 
 def _explain_code(code: str) -> str:
@@ -92,10 +78,8 @@ Listener = Callable[[Update], None]
 class Session:
     """A protocol bound to a device, a record and a listener; times are s of a clock that never goes back.
 
-    Attributes
-    ----------
-    samples, lost : how many came, and how many never did.
-    unreachable : pins that did not come home.
+    ``samples`` and ``lost`` say how many came, and how many never did; ``unreachable`` pins did not come
+    home.
     """
 
     def __init__(
@@ -227,16 +211,16 @@ class Session:
         if self.recorder is not None:
             self.recorder.event(name, round(now * 1e6), **facts)
 
-    def _execute(self, actions: tuple[Action, ...], now: float) -> None:
+    def _execute(self, actions: tuple[wire.Action, ...], now: float) -> None:
         with self._guard_link(now):
             for action in actions:
                 self.device.send(action, now)
                 match action:
-                    case Move(pin=pin, target_um=target, speed_um_s=speed):
+                    case wire.Move(pin=pin, target_um=target, speed_um_s=speed):
                         self._record("move", now, pin=pin, target_um=target, speed_um_s=speed)
-                    case Hold(pin=pin):
+                    case wire.Hold(pin=pin):
                         self._record("hold", now, pin=pin)
-                    case Stop(reason=reason):
+                    case wire.Stop(reason=reason):
                         self._record("stop", now, reason=reason)
 
     @contextmanager
@@ -263,14 +247,8 @@ def prioritise() -> str:
 def run_session(session: Session, operator: SimpleQueue[Event]) -> Protocol:
     """Run a session to its end in this thread; returns its protocol, which says how it ended.
 
-    Parameters
-    ----------
-    operator : events of the operator, put there by any thread.
-
-    Notes
-    -----
-    Other threads may hold the interpreter for the switch interval, so that is set to 0.2 ms meanwhile; the
-    collector of garbage is off.
+    ``operator``: events of the operator, put there by any thread. Other threads may hold the interpreter for
+    the switch interval, so that is set to 0.2 ms meanwhile; the collector of garbage is off.
     """
     interval = sys.getswitchinterval()
     sys.setswitchinterval(0.0002)
@@ -316,3 +294,58 @@ def _run_loop(session: Session, operator: SimpleQueue[Event]) -> None:
             while True:
                 session.handle(operator.get_nowait(), now)
         session.tick(now)
+
+
+class Keyboard:
+    """Characters of a terminal to events: Enter confirms, the space bar is the key, anything else stops.
+
+    A terminal tells of no release: a key that is held repeats, one that is released does not. The key counts
+    as held from its second character on, so that a touch moves nothing, and as released once ``gap_s`` has
+    passed without another.
+    """
+
+    def __init__(self, gap_s: float) -> None:
+        self.gap_s = gap_s
+        self.is_held = False
+        self._last: float | None = None
+
+    def read(self, characters: bytes, now: float) -> list[Event]:
+        found: list[Event] = []
+        for one in characters:
+            if one in b"\r\n":
+                found.append(Signal.CONFIRM)
+            elif one == 0x20:
+                before, self._last = self._last, now
+                if not self.is_held and before is not None and now - before <= FIRST_REPEAT_S:
+                    self.is_held = True
+                    found.append(Signal.KEY_DOWN)
+            else:
+                found.append(Abort("the operator stopped it by a key"))
+        return found
+
+    def check_release(self, now: float) -> list[Event]:
+        """The release of the key, reported once; ask often."""
+        if self._last is None or not self.is_held or now - self._last <= self.gap_s:
+            return []
+        self.is_held, self._last = False, None
+        return [Signal.KEY_UP]
+
+
+class NoOperator:
+    """No operator: the limb counts as in place, and the key as held until the search ends by itself."""
+
+    def __init__(self, events: SimpleQueue[Event]) -> None:
+        self.events = events
+        self._has_searched = False
+
+    def __call__(self, update: Update) -> None:
+        if not isinstance(update, PhaseUpdate):
+            return
+        if update.phase == Phase.POSITION:
+            self.events.put(Signal.CONFIRM)
+        elif update.phase == Phase.READY and self._has_searched:  # it would end there again, and again
+            reason = "the depth search ended at acquire.search_force_N before acquire.min_depth_mm"
+            self.events.put(Abort(f"{reason}; change one of them"))
+        elif update.phase == Phase.READY:
+            self._has_searched = True
+            self.events.put(Signal.KEY_DOWN)

@@ -14,25 +14,17 @@ from ..errors import ImageError, LabelError, add_location
 from .grid import LabelMap, Volume
 from .images.dicom import read_series
 from .images.formats import describe_forms, format_of, read_image
-from .labels.dicom_labels import find_dicom_labels, read_dicom_labels
+from .labels import labelfiles
 from .labels.labelcheck import place_on_grid
-from .labels.labelfiles import is_seg_nrrd, read_label_image, read_seg_nrrd, write_seg_nrrd, write_sidecar
 
 _SMALLEST_MM, _LARGEST_MM = 60.0, 3000.0  # of the longest side of an image
 
 
 def read_volume(path: str | Path, series_uid: str | None = None) -> Volume:
-    """An image with its full geometry.
+    """An image with its full geometry, from a DICOM folder or one file of a format in `images.formats`.
 
-    Parameters
-    ----------
-    path : a DICOM folder, or one file of a format in `images.formats`.
-    series_uid : which DICOM series, where the folder holds several.
-
-    Raises
-    ------
-    ImageError
-        With the file, the place and the remedy.
+    ``series_uid`` says which DICOM series, where the folder holds several. Raises `ImageError` with the file,
+    the place and the remedy.
     """
     path = Path(path)
     if path.is_dir():
@@ -74,26 +66,25 @@ def check_image(volume: Volume, path: str | Path) -> None:
 def read_labels(path: str | Path, like: Volume | None = None) -> LabelMap:
     """A label map: ``.seg.nrrd``, DICOM-SEG, RTSTRUCT, or a label image with default or sidecar names.
 
+    Raises `LabelError` also for a map whose voxels are not those of ``like``, and for one without a single
+    labelled voxel.
+
     Parameters
     ----------
     path : the file, or a folder with one DICOM-SEG or RTSTRUCT; a plain image may have its names in
         ``<file>.json``.
     like : the image that it belongs to: the map is brought to its grid, voxel by voxel. Contours need it.
-
-    Raises
-    ------
-    LabelError
-        Also for a map whose voxels are not those of ``like``, and for one without a single labelled voxel.
     """
     path = Path(path)
     try:
-        dicom = find_dicom_labels(path)
+        dicom = labelfiles.find_dicom_labels(path)
         if dicom is not None:
             with add_location(file=dicom):
-                labels = read_dicom_labels(dicom, like)
+                labels = labelfiles.read_dicom_labels(dicom, like)
+        elif labelfiles.is_seg_nrrd(path):
+            labels = labelfiles.read_seg_nrrd(read_image(path))
         else:
-            image = read_image(path)
-            labels = read_seg_nrrd(image) if is_seg_nrrd(path) else read_label_image(path, image)
+            labels = labelfiles.read_label_image(path, read_image(path))
         if not labels.array.any():
             raise LabelError("the label map is empty", remedy="give one with the limb labelled")
         return labels if like is None else place_on_grid(labels, like)
@@ -105,9 +96,9 @@ def read_labels(path: str | Path, like: Volume | None = None) -> LabelMap:
 def write_labels(path: str | Path, labels: LabelMap) -> None:
     """Write ``.seg.nrrd`` with names and colours, or a plain image with its names in ``<file>.json``."""
     path = Path(path)
-    if is_seg_nrrd(path):
-        write_seg_nrrd(path, labels)
+    if labelfiles.is_seg_nrrd(path):
+        labelfiles.write_seg_nrrd(path, labels)
         return
     format_of(path, written=True)
     sitk.WriteImage(labels.to_sitk(), str(path), useCompression=True)
-    write_sidecar(path, labels.names)
+    labelfiles.write_sidecar(path, labels.names)

@@ -21,7 +21,7 @@ from ..fe import ELEMENTS, History, Indenter, OgdenQLV, Problem, StepControl, so
 from ..febio import find_febio, read_log, run_febio
 from ..indentation import SiteModel
 from ..mesh import Mesh, to_tet10
-from ..mesh.boxes import HEX, SIX_TETS, build_boxes
+from ..mesh.cells import HEX, SIX_TETS, build_boxes
 from ..study import SolverTable
 from . import UNKNOWNS
 from .parity import PUNCHED, Tell, find_reference, load_case

@@ -23,8 +23,17 @@ from typer import Argument, Exit, Option
 
 import limbfit
 
-from ..acquire import DEFAULT_ADDRESS, DEFAULT_PORT, Keyboard, LiveUpdate, PhaseUpdate, Update, prioritise
-from ..acquire.events import Abort, Event
+from ..acquire import (
+    DEFAULT_ADDRESS,
+    DEFAULT_PORT,
+    Event,
+    Keyboard,
+    LiveUpdate,
+    PhaseUpdate,
+    Update,
+    prioritise,
+)
+from ..acquire.protocol import Abort
 from ..acquire.virtual import Serving, read_faults
 from ..errors import InputError
 from .commands import StudyPath

@@ -1,5 +1,7 @@
 """Cell types: nodes, shape functions, faces and quadrature of each, and its names elsewhere, as data.
 
+Also grids of boxes, and the cells that they are cut into.
+
 Local coordinates: tetrahedra and triangles on the unit simplex, hexahedra and quadrilaterals on [-1, 1]^d,
 nodes in VTK order.
 """
@@ -23,6 +25,9 @@ _TET10_FACES = np.array([[0, 2, 1, 6, 5, 4], [0, 1, 3, 4, 8, 7], [1, 2, 3, 5, 9,
 _HEX_FACES = np.array([[0, 3, 2, 1], [4, 5, 6, 7], [0, 1, 5, 4], [1, 2, 6, 5], [2, 3, 7, 6], [3, 0, 4, 7]])
 # Keast's five points; the Jacobian of a quadratic tetrahedron is cubic.
 _KEAST = np.vstack([np.full(3, 0.25), np.full((3, 3), 1 / 6) + np.eye(3) / 3, np.full(3, 1 / 6)])
+# Kuhn's six tetrahedra of a box whose corners are numbered 4 i + 2 j + k.
+SIX_TETS = np.array([[0, 1, 3, 7], [0, 3, 2, 7], [0, 2, 6, 7], [0, 6, 4, 7], [0, 4, 5, 7], [0, 5, 1, 7]])
+HEX = np.array([0, 4, 6, 2, 1, 5, 7, 3])
 
 
 @dataclass(frozen=True)
@@ -112,3 +117,12 @@ CELLS: dict[str, CellType] = {
         ),
     )
 }  # fmt: skip
+
+
+def build_boxes(x: Array, y: Array, z: Array) -> tuple[Array, Indices]:
+    """Grid points (n, 3) and the corners (m, 8) of each box, numbered 4 i + 2 j + k."""
+    grid = np.stack(np.meshgrid(x, y, z, indexing="ij"), axis=-1)
+    index = np.arange(grid[..., 0].size).reshape(grid.shape[:3])
+    low, high = slice(None, -1), slice(1, None)
+    corners = [index[i, j, k].ravel() for i in (low, high) for j in (low, high) for k in (low, high)]
+    return grid.reshape(-1, 3), np.stack(corners, axis=1)

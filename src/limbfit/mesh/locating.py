@@ -24,16 +24,13 @@ _SAME_MM = 1e-6
 def locate(mesh: Mesh, points: Array, region: int) -> tuple[Indices, Array, Array]:
     """Cells (k,) of a region that hold ``points`` (k, 3), mm, or come nearest to that.
 
+    Raises `ProblemError` where no cell is of that region.
+
     Returns
     -------
     cells : (k,) their numbers.
     local : (k, 3) local coordinates of the points, moved into the cell where they are out of it.
     off_mm : (k,) how far they were moved.
-
-    Raises
-    ------
-    ProblemError
-        Where no cell is of that region.
     """
     candidates = np.flatnonzero(mesh.regions == region)
     if not len(candidates):
@@ -116,16 +113,9 @@ def find_gauges_along(mesh: Mesh, origin: Array, axis: Array) -> tuple[LayerGaug
 
     It ends where the line first leaves the mesh: at bone, which is hollow, or at the other side. Of a region
     that is met twice, as skin is where the line passes no bone, the first part counts. Curved faces are met
-    as the flat triangles of their corners, and quadrilaterals as two.
-
-    Parameters
-    ----------
-    origin, axis : (3,) a point in mm, and the direction in which regions are met.
-
-    Raises
-    ------
-    ProblemError
-        Where the line does not enter the mesh.
+    as the flat triangles of their corners, and quadrilaterals as two. The line is given by a point (3,) in
+    mm, and the direction (3,) in which regions are met. Raises `ProblemError` where it does not enter the
+    mesh.
     """
     axis = np.asarray(axis, dtype=float) / np.linalg.norm(axis)
     crossings = _find_crossings(mesh, np.asarray(origin, dtype=float), axis)

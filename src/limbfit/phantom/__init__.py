@@ -2,4 +2,4 @@
 
 from .build import draw_true_parameters, make_phantom, unpack_patient
 from .geometry import LIMBS, Limb, make_limb
-from .sites import TrueSite, build_true_sites
+from .robot import TrueSite, build_true_sites

@@ -27,26 +27,18 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from scipy.interpolate import interp1d
 
 from ..anatomy.imaging import write_labels
-from ..anatomy.surfaces.surfaces import Anatomy, save_anatomy
+from ..anatomy.surfaces.surfaces import Anatomy, Surface, save_anatomy
+from ..anatomy.surfaces.triangles import write_surface
 from ..arrays import Array
 from ..errors import InputError
 from ..indentation import Parameters
-from .forces import ForceJob, TrueForce, choose_discretisation, mesh_true_site, simulate_true_force
-from .geometry import SKIN_AND_FAT, SKIN_LAYER, TENDON, Limb, make_limb
+from ..socket import Area, Recipe, Socket, read_socket, rectify_limb
+from ..socket.landmarks import Directions, build_default_regions, find_directions, find_knee_centre
+from ..socket.trim import Trim
+from . import geometry, robot
+from .geometry import SKIN_AND_FAT, SKIN_LAYER, TENDON, Limb
 from .mri import DETAIL_GRIDS, LABELS_FILE, TENDON_LABEL, build_true_labels, make_grid, write_series
-from .record import SecondaryMeasurements, record, write_surface, write_ultrasound, write_waves
-from .sites import (
-    DETAIL_SITES,
-    INDENTER_EDGE_MM,
-    INDENTER_MM,
-    TrueSite,
-    build_markers,
-    build_true_sites,
-    select_sites,
-)
-from .socket import FILE as SOCKET_FILE
-from .socket import LINER_MM, write_socket
-from .surfaces import build_true_anatomy
+from .robot import DETAIL_SITES, INDENTER_EDGE_MM, INDENTER_MM, TrueForce, TrueSite, select_sites
 
 Mapping = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
 Listener = Callable[[str, float, float], None]
@@ -60,6 +52,28 @@ TENDON_KPA = 30.0
 PARAMETER_SPREAD = 0.15
 KAPPA_RATIO = 100.0
 PACKED = "patient.zip"
+SOCKET_FILE = Path("socket") / "socket.stl"
+LINER_MM = 6.0
+REDUCTION_PERCENT = 3.0
+BELOW_KNEE_MM, BAND_MM = 10.0, 6.0  # of the brim at the back, and of the skin that says how far back it is
+BELOW_CUT_MM = 30.0  # of a thigh's brim
+# Region, radius and depth (mm) of what is pressed in or relieved.
+SOCKET_AREAS = {
+    "transtibial": (
+        ("patellar tendon", 25.0, 4.0),
+        ("medial proximal", 30.0, 3.0),
+        ("posterior proximal", 35.0, 4.0),
+        ("tibial crest", 25.0, -2.0),
+        ("fibular head", 20.0, -3.0),
+        ("distal tibia", 25.0, -3.0),
+    ),
+    "transfemoral": (
+        ("anterior proximal", 40.0, 4.0),
+        ("posterior proximal", 40.0, 3.0),
+        ("lateral middle", 40.0, 3.0),
+        ("lateral distal", 30.0, -3.0),
+    ),
+}
 
 
 @dataclass(frozen=True)
@@ -72,7 +86,7 @@ class _Patient:
     marked: tuple[TrueSite, ...]
     indented: tuple[TrueSite, ...]
     parameters: Parameters
-    measurements: SecondaryMeasurements
+    measurements: robot.SecondaryMeasurements
     has_socket: bool
 
 
@@ -116,6 +130,9 @@ def make_phantom(
 ) -> dict[str, Any]:
     """Make a synthetic patient in ``folder``; nothing is left there unless all of it was made.
 
+    Returns what ``truth.json`` holds. Raises `InputError` for a folder that is not empty, an unknown detail,
+    limb or site, or a tendon of a thigh.
+
     Parameters
     ----------
     folder : must not exist, or be empty.
@@ -132,23 +149,13 @@ def make_phantom(
     mapping : like ``map``; given one that works in several processes, sites are meshed and simulated side by
         side.
     progress : called with what is being done, how much of it is done, and of how much.
-
-    Returns
-    -------
-    dict
-        What ``truth.json`` holds.
-
-    Raises
-    ------
-    InputError
-        For a folder that is not empty, an unknown detail, limb or site, or a tendon of a thigh.
     """
     folder = Path(folder)
     tell = progress or (lambda text, done, total: None)
     if detail not in DETAIL_GRIDS:
         raise InputError(f"unknown detail {detail!r}", remedy=f"use one of {', '.join(DETAIL_GRIDS)}")
-    made_limb = make_limb(seed, SKIN_AND_FAT if fat else SKIN_LAYER, tendon, limb)
-    marked = build_true_sites(made_limb, seed)
+    made_limb = geometry.make_limb(seed, SKIN_AND_FAT if fat else SKIN_LAYER, tendon, limb)
+    marked = robot.build_true_sites(made_limb, seed)
     patient = _Patient(
         seed=seed,
         detail=detail,
@@ -156,12 +163,12 @@ def make_phantom(
         marked=marked,
         indented=select_sites(marked, DETAIL_SITES[detail] if sites is None else sites),
         parameters=draw_true_parameters(seed, fat, tendon),
-        measurements=SecondaryMeasurements(ultrasound, surface, shear_waves),
+        measurements=robot.SecondaryMeasurements(ultrasound, surface, shear_waves),
         has_socket=socket,
     )
     with _open_hidden_folder(folder) as work:
         truth = _truth_to_dict(patient)
-        anatomy = build_true_anatomy(made_limb)
+        anatomy = geometry.build_true_anatomy(made_limb)
         if socket:
             truth["socket"] = write_socket(work, made_limb, anatomy)
         _write_images(work, patient, tell)
@@ -174,15 +181,7 @@ def make_phantom(
 def unpack_patient(folder: str | Path) -> dict[str, Any]:
     """Unpack what :func:`make_phantom` makes by default, which comes with limbfit, into ``folder``.
 
-    Returns
-    -------
-    dict
-        What ``truth.json`` holds.
-
-    Raises
-    ------
-    InputError
-        For a folder that is not empty.
+    Returns what ``truth.json`` holds. Raises `InputError` for a folder that is not empty.
     """
     with (
         _open_hidden_folder(Path(folder)) as work,
@@ -218,7 +217,7 @@ def _write_images(work: Path, patient: _Patient, tell: Listener) -> None:
     if limb.has_tendon:
         (work / LABELS_FILE.parent).mkdir()
         write_labels(work / LABELS_FILE, build_true_labels(limb, grid))
-    markers = build_markers(patient.marked)
+    markers = robot.build_markers(patient.marked)
     series = (("plain", (), "UTE residuum"), ("markers", markers, "UTE residuum, markers"))
     for number, (name, shown, description) in enumerate(series, start=1):
         write_series(
@@ -241,18 +240,19 @@ def _write_traces(
     truth.mkdir()
     traces.mkdir()
     save_anatomy(truth, anatomy)
-    made, indented = choose_discretisation(patient.detail, patient.limb.kind), patient.indented
+    made, indented = robot.choose_discretisation(patient.detail, patient.limb.kind), patient.indented
     settings = replace(made.mesh, layers=patient.limb.layers)
-    mesh = partial(mesh_true_site, folder=truth, settings=settings, within_mm=made.within_mm)
-    jobs: list[ForceJob] = []
+    mesh = partial(robot.mesh_true_site, folder=truth, settings=settings, within_mm=made.within_mm)
+    jobs: list[robot.ForceJob] = []
     tell("meshes", 0, len(indented))
     for site, site_mesh in zip(indented, mapping(mesh, indented), strict=True):
         steps = made.steps(site.thickness)
-        jobs.append(ForceJob(site, site_mesh, steps, patient.parameters, patient.measurements))
+        jobs.append(robot.ForceJob(site, site_mesh, steps, patient.parameters, patient.measurements))
         tell("meshes", len(jobs), len(indented))
     tell("forces", 0, len(jobs))
     facts = []
-    for i, (site, found) in enumerate(zip(indented, mapping(simulate_true_force, jobs), strict=True)):
+    forces = mapping(robot.simulate_true_force, jobs)
+    for i, (site, found) in enumerate(zip(indented, forces, strict=True)):
         facts.append(_record_site(traces, site, found, patient.seed))
         tell("forces", i + 1, len(jobs))
     return facts
@@ -265,14 +265,14 @@ def _record_site(traces: Path, site: TrueSite, simulated: TrueForce, seed: int) 
     def draw(purpose: int) -> np.random.Generator:
         return np.random.default_rng([seed, purpose, int(site.name)])
 
-    made = record(site.ramp, follow(simulated.force), draw(8))
+    made = robot.record(site.ramp, follow(simulated.force), draw(8))
     made.write(traces / f"site-{site.name}.csv")
     if simulated.layers:
         layers = {tissue: (rest, follow(lost)) for tissue, (rest, lost) in simulated.layers.items()}
-        write_ultrasound(traces / f"site-{site.name}-layers.csv", made, layers, draw(11))
+        robot.write_ultrasound(traces / f"site-{site.name}-layers.csv", made, layers, draw(11))
     if len(simulated.skin_points):
         moves = interp1d(simulated.times, simulated.skin_moves)
-        write_surface(
+        robot.write_surface(
             traces / f"site-{site.name}-surface.csv",
             made,
             simulated.skin_points,
@@ -281,7 +281,7 @@ def _record_site(traces: Path, site: TrueSite, simulated: TrueForce, seed: int) 
         )
     if simulated.speeds:
         speeds = {tissue: follow(speed) for tissue, speed in simulated.speeds.items()}
-        write_waves(traces / f"site-{site.name}-waves.csv", made, speeds, draw(13))
+        robot.write_waves(traces / f"site-{site.name}-waves.csv", made, speeds, draw(13))
     return {
         **_site_to_dict(site),
         "depth_mm": site.depth,
@@ -307,7 +307,7 @@ def _site_to_dict(site: TrueSite) -> dict[str, Any]:
 
 def _truth_to_dict(patient: _Patient) -> dict[str, Any]:
     limb = patient.limb
-    made = choose_discretisation(patient.detail, limb.kind)
+    made = robot.choose_discretisation(patient.detail, limb.kind)
     return {
         "seed": patient.seed,
         "detail": patient.detail,
@@ -350,3 +350,58 @@ def _format_study(patient: _Patient) -> str:
         socket_file=SOCKET_FILE.as_posix(),
         liner_mm=f"{LINER_MM:g}",
     )
+
+
+def make_socket(anatomy: Anatomy, outer: Surface, kind: str = "transtibial") -> tuple[Socket, list[Area]]:
+    """Make the socket around a limb in a liner, and its areas: a shank's bears on the patellar tendon.
+
+    The anatomy of a shank has a tibia and a patella; ``outer`` is the closed surface of the liner, LPS mm,
+    flat at the same proximal cut; ``kind`` is one of ``LIMBS``. Raises `SurfaceError` where the limb has no
+    place for it.
+    """
+    directions = find_directions(anatomy, "right")
+    regions = build_default_regions(anatomy, directions)
+    areas = [Area(name, regions[name].position, radius, depth) for name, radius, depth in SOCKET_AREAS[kind]]
+    knee, frame = find_knee_centre(anatomy), anatomy.frame
+    if knee is None:
+        trim = Trim([(anatomy.cut_point - BELOW_CUT_MM * anatomy.cut_normal, anatomy.cut_normal)])
+    else:
+        trim = _trim_around_tendon(anatomy, directions, knee)
+    return rectify_limb(outer, frame, Recipe(trim, REDUCTION_PERCENT, areas)), areas
+
+
+def _trim_around_tendon(anatomy: Anatomy, directions: Directions, knee: Array) -> Trim:
+    """Trim as a patellar-tendon-bearing socket is: from the patella's middle to below the knee at the back.
+
+    A brim below the knee all around would cut through the bar on the tendon, half of which lies above it.
+    """
+    front, skin = anatomy.bones["patella"].points.mean(axis=0), anatomy.skin.points
+    near = np.abs(anatomy.height(skin) - anatomy.height(knee) + BELOW_KNEE_MM) < BAND_MM
+    behind = ((skin[near] - knee) @ directions.anterior).min()
+    back = knee + behind * directions.anterior - BELOW_KNEE_MM * directions.proximal
+    slope = (front - back) @ directions.proximal / ((front - back) @ directions.anterior)
+    return Trim([(front, directions.proximal - slope * directions.anterior)])
+
+
+def write_socket(folder: Path, limb: Limb, anatomy: Anatomy) -> dict[str, Any]:
+    """Write the socket of a limb into a study's folder and read it back; returns what is true of it."""
+    outer = geometry.build_outer_surface(limb, LINER_MM)
+    socket, areas = make_socket(anatomy, outer, limb.kind)
+    (folder / SOCKET_FILE).parent.mkdir()
+    write_surface(folder / SOCKET_FILE, socket.surface)
+    read_socket(folder / SOCKET_FILE, outer=outer, frame=anatomy.frame, bones=anatomy.bones)
+    return {
+        "file": SOCKET_FILE.as_posix(),
+        "liner_mm": LINER_MM,
+        "reduction_percent": REDUCTION_PERCENT,
+        "volume_mm3": socket.volume_mm3,
+        "areas": [
+            {
+                "name": a.name,
+                "position_mm": a.position.tolist(),
+                "radius_mm": a.radius_mm,
+                "depth_mm": a.depth_mm,
+            }
+            for a in areas
+        ],
+    }

@@ -24,8 +24,7 @@ from scipy.special import ndtr
 from ..anatomy.grid import DEFAULT_NAMES
 from ..anatomy.imaging import LabelMap
 from ..arrays import Array
-from .geometry import Limb, build_rotation
-from .limb_shapes import PROXIMAL_CUT_MM, Floats, intersect_fields
+from .geometry import PROXIMAL_CUT_MM, Floats, Limb, build_rotation, intersect_fields
 
 FAT, MUSCLE, MARROW, CORTEX, TENDON, MARKER = 1.0, 0.5, 0.8, 0.12, 0.3, 1.15
 MARKER_DIAMETER_MM, MARKER_HEIGHT_MM = 9.0, 5.0

@@ -6,16 +6,16 @@ docs/extending.md.
 
 from ..errors import InputError
 from ..extensions import Registry
-from .builtin import Cylinder, Sphere, Square, Stl
-from .facets import Facets as Facets
-from .facets import revolved as revolved
-from .facets import steps as steps
-from .rigid_surface import RigidSurface as RigidSurface
 from .shape import SHARP_EDGE as SHARP_EDGE
+from .shape import Cylinder, Sphere, Square, Stl
+from .shape import Facets as Facets
 from .shape import Measure as Measure
 from .shape import Revolution as Revolution
 from .shape import Shape as Shape
 from .shape import Size as Size
+from .shape import revolved as revolved
+from .shape import steps as steps
+from .triangles import RigidSurface as RigidSurface
 
 BUILTIN_SHAPES: tuple[type[Shape], ...] = (Square, Sphere, Cylinder, Stl)
 SHAPES: Registry[type[Shape]] = Registry("indenter shape", {shape.name: shape for shape in BUILTIN_SHAPES})

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 from scipy.sparse import csr_array
 
-from ..anatomy.frame import Frame
+from ..anatomy.grid import Frame
 from ..anatomy.surfaces.mending import open_loops
 from ..anatomy.surfaces.triangles import Surface, find_half_edges
 from ..arrays import Array, Indices

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.interpolate import RegularGridInterpolator
 from scipy.ndimage import gaussian_filter
 
-from ..anatomy.frame import Frame, format_place
+from ..anatomy.grid import Frame, format_place
 from ..anatomy.surfaces.triangles import Surface
 from ..arrays import Array
 from ..errors import SurfaceError

@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from ..anatomy.frame import Frame, format_place
+from ..anatomy.grid import Frame, format_place
 from ..anatomy.surfaces.triangles import Surface
 from ..arrays import Array, Indices
 from ..errors import SurfaceError

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.interpolate import PchipInterpolator
 
-from ..anatomy.frame import Frame
+from ..anatomy.grid import Frame
 from ..arrays import Array
 from ..errors import SurfaceError
 from .rays import LimbProfile

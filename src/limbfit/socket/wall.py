@@ -5,7 +5,7 @@ from itertools import pairwise
 import manifold3d
 import numpy as np
 
-from ..anatomy.frame import build_limb_frame
+from ..anatomy.grid import build_limb_frame
 from ..anatomy.surfaces.triangles import Surface
 from ..arrays import Array
 from ..errors import SurfaceError

@@ -11,9 +11,9 @@ from fastapi import APIRouter, Query
 from pydantic import BaseModel, ValidationError
 
 from ..acquire import Recording, follow_recording
-from ..acquire.events import PINS
+from ..acquire.line_protocol import PINS
 from ..acquire.protocol import FINAL
-from ..acquire.quality import Check
+from ..acquire.recording import Check
 from ..errors import TraceError
 from ..pipeline.commands.acquire import FOLDER as ACQUIRED
 from ..pipeline.commands.acquire import RECORD, VERDICT

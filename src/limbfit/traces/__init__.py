@@ -14,8 +14,7 @@ Units: s, mm, N; force positive when pushing, displacement positive into the lim
 """
 
 from .interpretation import InterpretedRecord, interpret_record
-from .reading import read_trace
-from .record import COLUMNS, Trace, TraceWarning, check_trace
+from .record import COLUMNS, Trace, TraceWarning, check_trace, read_trace
 from .regularise import Creep, Regularised, regularise, regularise_creep
 from .secondary_measurements import (
     Layers,

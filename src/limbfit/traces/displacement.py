@@ -6,15 +6,10 @@ from functools import cached_property
 import numpy as np
 from scipy.optimize import least_squares
 
+from ..arrays import Array
 from ..errors import TraceError
 from ..phases import MotionPhase, choose_tolerance_mm, find_phases, find_way_in
-from .numerics import (
-    Array,
-    average_in_bins,
-    build_linear_interpolation,
-    estimate_noise_level,
-    find_resolution,
-)
+from .numerics import average_in_bins, build_linear_interpolation, estimate_noise_level, find_resolution
 
 _MAX_CORNERS = 41
 # Of a step in which the displacement comes: half of one is rounded, and corners are off too.

@@ -16,10 +16,10 @@ import numpy as np
 from scipy.io import loadmat, whosmat
 
 from ..errors import TraceError
-from .record import MAX_SAMPLES
 
 BINARY_SUFFIXES = (".mat", ".tdms", ".xlsx", ".xlsm", ".xls")  # of files that are no text
 MAX_PREAMBLE = 1000  # lines before the header
+MAX_SAMPLES = 20_000_000
 TIME = "time_s"  # the key of the times
 _END_OF_HEADER = "***End_of_Header***"
 _X = "X_Value"  # LabVIEW's name of the times

@@ -3,7 +3,7 @@
 Rows that are there twice are left out, rounded times are spread, single samples that stick out are replaced
 by their neighbours' line, a force that drifts is set straight by what the sensor says clear of the skin, and
 a record that begins in contact is refused, because nobody knows where its skin was met. Warnings say what was
-done, and what the user should know (`faults`, `passivity`); the touch-down's deviation counts it.
+done, and what the user should know (`faults`); the touch-down's deviation counts it.
 """
 
 from dataclasses import dataclass, replace
@@ -12,19 +12,11 @@ from typing import Any
 import numpy as np
 from scipy.ndimage import median_filter
 
+from ..arrays import Array, Mask
 from ..errors import TraceError
 from . import faults
 from .displacement import BrokenLine, fit_broken_line
-from .numerics import (
-    Array,
-    Mask,
-    average_in_bins,
-    estimate_noise,
-    estimate_noise_level,
-    find_resolution,
-    find_runs,
-)
-from .passivity import find_lag, find_swings
+from .numerics import average_in_bins, estimate_noise, estimate_noise_level, find_resolution, find_runs
 from .record import Trace, TraceWarning, measure_start_force
 from .touchdown import TouchDown, compute_deviation_before, find_depth_at, find_touch_down, touch_down_at
 
@@ -69,15 +61,9 @@ def interpret_record(
 ) -> InterpretedRecord:
     """Mend a record and find its touch-down, unless ``touch_down_s`` states it.
 
-    Parameters
-    ----------
-    forced : a force was stated to the machine, not a displacement.
-
-    Raises
-    ------
-    TraceError
-        Where it begins in contact, where more than 1 % of its samples stick out, where its force drifts by
-        more than 30 % of the peak, or as `find_touch_down` and `touch_down_at` do.
+    ``forced``: a force was stated to the machine, not a displacement. Raises `TraceError` where it begins in
+    contact, where more than 1 % of its samples stick out, where its force drifts by more than 30 % of the
+    peak, or as `find_touch_down` and `touch_down_at` do.
     """
     trace, doubled = faults.mend_times(trace)
     trace, spikes = _remove_spikes(trace)
@@ -122,9 +108,10 @@ def _find_impassive_force(
         return at_top
     way_in = (trace.time_s <= line.peak_s) & (trace.time_s >= touch.time_s)
     sample_noise = estimate_noise(trace.force_N[trace.time_s < touch.time_s], trace.force_N[way_in])
-    swing = [] if lost else find_swings(trace, line, touch, sample_noise, rise_N, [at for at, _ in steps])
-    odd = [*lost, *((at, at) for at, _ in steps)]
-    return [*swing, *find_lag(trace, line, touch, sample_noise, odd)]
+    stepped = [at for at, _ in steps]
+    swing = [] if lost else faults.find_swings(trace, line, touch, sample_noise, rise_N, stepped)
+    odd = [*lost, *((at, at) for at in stepped)]
+    return [*swing, *faults.find_lag(trace, line, touch, sample_noise, odd)]
 
 
 def _find_touch_down(trace: Trace, line: BrokenLine, touch_down_s: float | None, forced: bool) -> TouchDown:

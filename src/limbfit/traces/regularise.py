@@ -16,10 +16,11 @@ from scipy.interpolate import BSpline, make_smoothing_spline
 from scipy.linalg import eigh
 from scipy.optimize import minimize_scalar
 
+from ..arrays import Array
 from ..errors import TraceError
 from ..phases import DENSER, MotionPhase, find_boundaries, find_phases, find_way_in, spread
 from .displacement import fit_broken_line
-from .numerics import Array, average_in_bins, build_cubic_interpolation, compute_rms
+from .numerics import average_in_bins, build_cubic_interpolation, compute_rms
 from .record import Trace
 from .touchdown import TouchDown
 
@@ -98,18 +99,11 @@ def regularise(
 ) -> Regularised:
     """The record as smooth curves counted from touch-down.
 
-    Parameters
-    ----------
-    smoothing : penalty on the squared second derivative of force, s^3 (``lam`` of
-        ``scipy.interpolate.make_smoothing_spline`` on the samples as recorded); by default generalised
-        cross-validation chooses it for each phase.
-    peak_s : when the (first) way in ends, as someone states it; found where it is not given.
-
-    Raises
-    ------
-    TraceError
-        Where fewer than 8 samples lie between touch-down and the peak, or no smoothing can be chosen, or
-        the way in cannot end where it is stated to.
+    ``smoothing`` is the penalty on the squared second derivative of force, s^3 (``lam`` of
+    ``scipy.interpolate.make_smoothing_spline`` on the samples as recorded); by default generalised
+    cross-validation chooses it for each phase. ``peak_s``: when the (first) way in ends, as someone states
+    it; found where it is not given. Raises `TraceError` where fewer than 8 samples lie between touch-down and
+    the peak, or no smoothing can be chosen, or the way in cannot end where it is stated to.
     """
     line = fit_broken_line(trace.time_s, trace.displacement_mm, peak_s)
     start, end = touch_down.time_s, line.find_return_s(touch_down.displacement_mm)
@@ -290,18 +284,10 @@ class Creep(Regularised):
 def regularise_creep(
     trace: Trace, touch_down: TouchDown, smoothing: float | None = None, peak_s: float | None = None
 ) -> Creep:
-    """A record under a stated force as curves counted from touch-down.
+    """A record under a stated force as curves counted from touch-down, as `regularise` with both exchanged.
 
-    Parameters
-    ----------
-    smoothing : penalty on the squared second derivative of the displacement, s^3; by default generalised
-        cross-validation chooses it for each phase.
-    peak_s : when the force has first risen, as someone states it; found where it is not given.
-
-    Raises
-    ------
-    TraceError
-        Where the force never rises or is no ramps and holds, or no smoothing can be chosen.
+    ``peak_s``: when the force has first risen, as someone states it; found where it is not given. Raises
+    `TraceError` where the force never rises or is no ramps and holds, or no smoothing can be chosen.
     """
     since = trace.time_s - touch_down.time_s
     force = trace.force_N - touch_down.baseline_N

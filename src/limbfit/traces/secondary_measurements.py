@@ -16,8 +16,7 @@ import numpy as np
 from ..arrays import Array, Indices
 from ..errors import TraceError, add_location
 from .formats import TIME
-from .reading import read_columns
-from .record import check_finite
+from .record import check_finite, read_columns
 
 _LAYER_SUFFIX = "_mm"
 MIN_LAYER_READINGS = 5
@@ -70,12 +69,8 @@ class Thinning:
 
 
 def read_layers(path: str | Path, time_name: str) -> Layers:
-    """Read a table with a column of times and, for each tissue, a column such as ``muscle_mm``.
-
-    Raises
-    ------
-    TraceError
-        With the file, the column and the remedy.
+    """Read a table with a column of times and, for each tissue, a column such as ``muscle_mm``. Raises
+    `TraceError` with the file, the column and the remedy.
     """
     with add_location(file=path):
         time, columns = _read_timed_columns(path, time_name, _LAYER_SUFFIX, "thickness of a tissue")
@@ -195,12 +190,7 @@ class WaveMeans:
 def read_wave_speeds(path: str | Path, time_name: str) -> tuple[WaveSpeeds, ...]:
     """Read a table with a column of times and one for each place, such as ``skin_m_s``, ``muscle_12mm_m_s``.
 
-    A cell may be empty.
-
-    Raises
-    ------
-    TraceError
-        With the file, the column and the remedy.
+    A cell may be empty. Raises `TraceError` with the file, the column and the remedy.
     """
     with add_location(file=path):
         time, columns = _read_timed_columns(path, time_name, "_m_s", "speed of a wave", gaps=True)
@@ -289,12 +279,8 @@ def read_surface_motion(path: str | Path, time_name: str) -> SurfaceMotion:
     """Read a table with a row for each point at each time: where it is at rest, and its displacement.
 
     Columns are the time, ``x_mm``, ``y_mm``, ``z_mm`` and one or more of ``ux_mm``, ``uy_mm``, ``uz_mm``,
-    whose cells may be empty. Rows with the same position are of one point.
-
-    Raises
-    ------
-    TraceError
-        With the file, the column and the remedy.
+    whose cells may be empty. Rows with the same position are of one point. Raises `TraceError` with the file,
+    the column and the remedy.
     """
     with add_location(file=path):
         named = {TIME: time_name} | {name: name for name in _POSITION_COLUMNS}

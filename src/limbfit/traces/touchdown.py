@@ -14,10 +14,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ..arrays import Array
 from ..autoregressive import compute_block_covariance
 from ..errors import TraceError
 from .displacement import BrokenLine, fit_broken_line
-from .numerics import Array, SampleNoise, average_in_bins, estimate_noise, split_at_gaps
+from .numerics import SampleNoise, average_in_bins, estimate_noise, split_at_gaps
 from .record import MIN_SAMPLES, Trace
 
 _ONSET_LEVEL = 0.05  # of the peak force: more of the onset is no power law, where a punch comes full on

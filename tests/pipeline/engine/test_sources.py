@@ -67,7 +67,7 @@ def test_it_is_no_wider():
 
 def test_it_holds_what_lists_by_hand_forgot():
     assert "identify/fit/parameters.py" in names("design")
-    assert "mesh/boxes.py" in names("cube")
+    assert "mesh/cells.py" in names("cube")
     web = {"web/static/viewer.js", "web/static/web.css", "web/static/vendor/three.min.js"}
     assert web | {"report/templates/report.css", "report/templates/blocks.html.j2"} <= names("report")
     assert "anatomy/meshing/_worker.py" in names("mesh")
@@ -101,6 +101,6 @@ def test_a_changed_file_changes_what_it_decides_and_nothing_else(tmp_path):
         return {stage for stage, value in digests().items() if value != before[stage]}
 
     assert changed_by("report/templates/report.css", "/* */\n") == {"report", "cube"}
-    meshed = changed_by("anatomy/meshing/smoothing.py", "\n# a remark\n")
+    meshed = changed_by("anatomy/meshing/improving.py", "\n# a remark\n")
     assert "mesh" in meshed
     assert not meshed & {"segment", "surfaces", "sites", "traces", "calibrate", "predict", "report"}

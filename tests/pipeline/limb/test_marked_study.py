@@ -9,7 +9,7 @@ import limbfit
 from limbfit.errors import StudyError
 from limbfit.phantom.geometry import build_rotation, make_limb
 from limbfit.phantom.mri import make_grid, write_series
-from limbfit.phantom.sites import build_markers, build_true_sites
+from limbfit.phantom.robot import build_markers, build_true_sites
 
 SEED = 3
 TOLERANCE_MM = 1.5  # voxels of 2.4 mm

@@ -19,7 +19,7 @@ from limbfit.errors import StudyError
 from limbfit.febio import write_feb
 from limbfit.indentation import SimulationJob, SiteModel, build_problem, simulate, to_parameters
 from limbfit.mesh import read_vtu, write_vtu
-from limbfit.phantom.record import Ramp, record
+from limbfit.phantom.robot import Ramp, record
 from limbfit.pipeline.commands.run import compute_keys
 from limbfit.pipeline.engine.store import Store
 from limbfit.study import IndenterTable, SolverTable, Study

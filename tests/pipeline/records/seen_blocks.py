@@ -13,7 +13,7 @@ from limbfit.execution import SerialExecutor
 from limbfit.identify.uncertainty.uncertainty import Uncertainty
 from limbfit.indentation import Parameters, Simulation, SimulationJob, SiteModel, simulate
 from limbfit.mesh import Mesh, write_vtu
-from limbfit.phantom.record import Ramp, RobotRecord, record
+from limbfit.phantom.robot import Ramp, RobotRecord, record
 from limbfit.pipeline.engine.context import Context
 from limbfit.pipeline.identification.answer import (
     FineMeshCorrection,

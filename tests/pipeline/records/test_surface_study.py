@@ -16,7 +16,7 @@ from limbfit.indentation import (
     read_indenter,
 )
 from limbfit.mesh import Mesh
-from limbfit.phantom.record import write_surface
+from limbfit.phantom.robot import write_surface
 from limbfit.pipeline.identification.calibrate import run_calibrate
 from limbfit.pipeline.identification.predict import run_predict
 from limbfit.pipeline.records.secondary_measurements import MAX_POINTS, ChosenPoints, choose_points

@@ -13,7 +13,7 @@ from limbfit.bench.timing import build_layered_block as block_of
 from limbfit.errors import ProblemError, TraceError
 from limbfit.indentation import Simulation, SimulationJob, SiteModel, simulate, to_vector
 from limbfit.mesh import find_gauges_along
-from limbfit.phantom.record import write_ultrasound
+from limbfit.phantom.robot import write_ultrasound
 from limbfit.pipeline.identification.calibrate import run_calibrate
 from limbfit.pipeline.identification.predict import run_predict
 from limbfit.report.drawing.figures import draw_layer_figure

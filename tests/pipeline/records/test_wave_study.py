@@ -9,7 +9,7 @@ from seen_blocks import PUNCH, TRUTH, Made, SeenBlock, estimate_at_truth
 
 from limbfit.errors import TraceError
 from limbfit.indentation import Simulation, SiteModel, place_waves_under
-from limbfit.phantom.record import write_waves
+from limbfit.phantom.robot import write_waves
 from limbfit.pipeline.engine.context import Context
 from limbfit.pipeline.identification.calibrate import run_calibrate
 from limbfit.pipeline.identification.predict import run_predict

@@ -4,7 +4,6 @@ No hardware was at hand.  What is here behaves as the documents say a device mus
 that such devices plausibly have; it is no model of a particular one.
 """
 
-from .faults import FAULT_KINDS, Fault, read_faults
-from .fitsocket import VirtualFitSocket
-from .limb import Surrogate, VirtualLimb, fit_surrogate
+from .fitsocket import FAULT_KINDS, Fault, VirtualFitSocket, read_faults
+from .parts import Surrogate, VirtualLimb, fit_surrogate
 from .server import Serving, serve

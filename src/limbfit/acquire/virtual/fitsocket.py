@@ -2,20 +2,23 @@
 
 `VirtualFitSocket.step` is one millisecond of the device: motors, limb, sensors, its own limits and watchdog,
 and every second time a sample.  `VirtualFitSocket.feed` takes what came from limbfit.  Both return
-what goes out.
+what goes out.  Faults come on demand: what goes wrong, when, for how long.
 """
 
 import secrets
+import tomllib
 from collections import deque
+from pathlib import Path
+from typing import Annotated, Literal, get_args
 
 import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from ...errors import InputError
 from .. import line_protocol as wire
-from ..events import PINS, RATE_HZ, Fence, Flags, Hold, Move, Sample, Stop
+from ..line_protocol import PINS, RATE_HZ, Flags, Sample
 from ..safety import FROZEN_S, FROZEN_SAMPLES, Guard, SafetyLimits
-from .faults import Fault, FaultClock
-from .limb import VirtualLimb
-from .pins import STROKE_MM, Motors, Sensors
+from .parts import STROKE_MM, Motors, Sensors, VirtualLimb
 
 STEP_US = 1000
 STEPS_PER_SAMPLE = 1_000_000 // RATE_HZ // STEP_US  # steps per sample
@@ -27,6 +30,83 @@ MAX_RETRACT_UM_S = 100_000
 MAX_WATCHDOG_MS = 500
 MAX_LAG_US = 50_000  # a driven pin that stands for so long is stuck
 MAX_HOMING_US = 3_000_000  # pins that are not home so long after a stop are out of reach
+Kind = Literal[
+    "lost",  # lines of the device do not arrive
+    "deaf",  # lines of limbfit do not arrive
+    "late",  # lines of the device arrive `value` ms late
+    "corrupt",  # a byte of each line of the device is another
+    "stuck",  # a pin does not move
+    "saturated",  # a force sensor shows its end of scale
+    "dead",  # a force sensor shows the same for ever
+    "limb",  # the limb moves by `value` mm towards a pin
+    "power",  # the actuators have no power
+    "button",  # the device's emergency stop is pressed
+]
+FAULT_KINDS: tuple[str, ...] = get_args(Kind)
+
+
+class Fault(BaseModel):
+    """One fault; its time counts from the session's start, or from its first entry into a phase."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    kind: Kind
+    at_s: Annotated[float, Field(ge=0, le=1e5)] = 0.0
+    phase: str = ""
+    duration_s: Annotated[float, Field(gt=0, le=1e5)] = 1e5
+    pin: Annotated[int, Field(ge=1, le=PINS)] = 1
+    value: Annotated[float, Field(ge=-100, le=10_000)] = 0.0
+
+
+class _FaultFile(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+
+    faults: tuple[Fault, ...]
+
+
+def read_faults(file: Path) -> tuple[Fault, ...]:
+    """Read a TOML file of ``[[faults]]``. Raises `InputError` with the file and the key."""
+    if not file.is_file():
+        raise InputError("no such file", file=file, remedy="give a TOML file with [[faults]]")
+    try:
+        return _FaultFile(**tomllib.loads(file.read_text(encoding="utf-8"))).faults
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise InputError(f"not valid TOML: {error}", file=file) from None
+    except ValidationError as error:
+        first = error.errors()[0]
+        place = ".".join(str(part) for part in first["loc"]) or None
+        remedy = "see docs/acquire.md for the kinds of faults"
+        raise InputError(first["msg"], file=file, place=place, remedy=remedy) from None
+
+
+class FaultClock:
+    """Which faults are on, as time goes and phases are entered."""
+
+    def __init__(self, faults: tuple[Fault, ...]) -> None:
+        self.faults = faults
+        self._entered: dict[str, int] = {}
+        self.now_us = 0
+
+    def enter(self, phase: str) -> None:
+        self._entered.setdefault(phase, self.now_us)
+
+    def find_active(self, kind: str) -> list[Fault]:
+        """The faults of a kind that are on."""
+        return [fault for fault in self.faults if fault.kind == kind and self._is_on(fault)]
+
+    def compute_progress(self, fault: Fault) -> float:
+        """How much of a fault's time has passed, 0 to 1."""
+        start = self._start(fault)
+        return 0.0 if start is None else min(max((self.now_us - start) / 1e6 / fault.duration_s, 0.0), 1.0)
+
+    def _start(self, fault: Fault) -> float | None:
+        if fault.phase and fault.phase not in self._entered:
+            return None
+        return self._entered.get(fault.phase, 0) + fault.at_s * 1e6
+
+    def _is_on(self, fault: Fault) -> bool:
+        start = self._start(fault)
+        return start is not None and start <= self.now_us < start + fault.duration_s * 1e6
 
 
 class VirtualFitSocket:
@@ -157,15 +237,15 @@ class VirtualFitSocket:
                 return "" if self.limb.place_site(site, self._test_pin) else "unknown-site"
             case wire.NotePhase(name=phase):
                 self.faults.enter(phase)
-            case Stop():
+            case wire.Stop():
                 self._stop("asked")
             case _ if not self.is_armed:
                 return "not-armed"
-            case Hold(pin=pin):
+            case wire.Hold(pin=pin):
                 self.motors.halt(pin - 1)
-            case Fence(pin=pin, position_um=position):
+            case wire.Fence(pin=pin, position_um=position):
                 self._guard.set_depth(pin, position)
-            case Move():
+            case wire.Move():
                 return self._move(command)
         return ""
 
@@ -193,7 +273,7 @@ class VirtualFitSocket:
         self._sent.clear()
         return ""
 
-    def _move(self, move: Move) -> str:
+    def _move(self, move: wire.Move) -> str:
         k = move.pin - 1
         inward = move.target_um > 1000 * self.motors.position_mm[k]
         if self.stopped:

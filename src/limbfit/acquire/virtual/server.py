@@ -13,7 +13,7 @@ from typing import Any
 
 from ...errors import InputError, RunError
 from ..device import Link, TcpLink
-from ..events import PERIOD_US
+from ..line_protocol import PERIOD_US
 from .fitsocket import STEPS_PER_SAMPLE, VirtualFitSocket
 
 MAX_LEAD_US = 4 * PERIOD_US  # how far a paced device runs ahead of what its host has dealt with
@@ -110,12 +110,10 @@ def serve(
     speed: float = 1.0,
     tell: Callable[[str], None] = lambda _: None,
 ) -> None:
-    """Run a device until `Serving.stop`.
+    """Run a device until `Serving.stop`; ``tell`` is called with a line for each session and each stop.
 
-    Parameters
-    ----------
-    speed : how much faster than the wall's the device's clock may go; only a paced device waits for its host.
-    tell : called with a line for each session and each stop.
+    ``speed``: how much faster than the wall's the device's clock may go; only a paced device waits for its
+    host.
     """
     _Server(device, serving, speed, tell).run()
     serving.close()

@@ -119,18 +119,10 @@ def describe_series(folder: str | Path) -> list[dict[str, Any]]:
 
 
 def read_series(folder: str | Path, series_uid: str | None = None) -> Volume:
-    """The volume of a DICOM folder.
+    """The volume of a DICOM folder, of the series ``series_uid`` where it holds several.
 
-    Parameters
-    ----------
-    folder : holds the files of one or more series, in any order, with any names, one image or many frames
-        in each.
-    series_uid : which series, where there are several.
-
-    Raises
-    ------
-    ImageError
-        For no or several series, slices missing, doubled, tilted or of different geometry.
+    The files may be in any order, with any names, one image or many frames in each. Raises `ImageError` for
+    no or several series, slices missing, doubled, tilted or of different geometry.
     """
     series = _choose_series(Path(folder), list_series(folder), series_uid)
     with add_location(file=folder):

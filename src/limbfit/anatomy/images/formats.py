@@ -185,9 +185,7 @@ class _HeaderForms(NamedTuple):
 def describe_forms(path: Path, affine: Array) -> tuple[str, ...]:
     """Say which of a file's qform and sform an image lies by, where they differ.
 
-    Parameters
-    ----------
-    affine : (4, 4) of the image that was read, from indices to LPS mm.
+    ``affine`` (4, 4) is that of the image that was read, from indices to LPS mm.
     """
     forms = _read_forms(path)
     if forms is None:

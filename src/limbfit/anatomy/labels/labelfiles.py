@@ -1,22 +1,40 @@
-"""Label maps on disk: the ``.seg.nrrd`` of 3D Slicer, and plain label images.
+"""Label maps on disk: the ``.seg.nrrd`` of 3D Slicer, label images, files of contours, and DICOM objects.
 
 A ``.seg.nrrd`` as Slicer saves it may be cropped to the segments, may hold several layers of overlapping
 segments (a fourth, leading axis), and may be in RAS; all three are brought back to one LPS label map.
 Header fields: https://slicer.readthedocs.io/en/latest/developer_guide/modules/segmentations.html
+
+Contours are closed polygons on the slices of an image. A voxel belongs to a structure where its centre lies
+inside an odd number of the structure's contours of that slice, so a contour inside another is a hole, as is
+the inner part of a keyhole contour (DICOM PS3.3, C.8.8.6). The CSV file has one row for each point: the name
+of the structure; the slice of the image, counted from 0; the number of the contour on that slice; the point
+in LPS mm. The last point of a contour is joined to its first. The points decide; the slice is for readers.
+
+A DICOM-SEG has a frame for each slice and segment, as binary masks or as a label map. Frames may cover any
+part of the slices, in any order (DICOM PS3.3, A.51). They are put on a grid of their own, and from there on
+that of the image. An RTSTRUCT holds contours.
 """
 
+import csv
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
+import pydicom
 import SimpleITK as sitk  # noqa: N813
+from contourpy import contour_generator
 from numpy.typing import NDArray
+from pydicom.dataset import Dataset, FileDataset
+from pydicom.errors import InvalidDicomError
 
-from ...arrays import Mask
-from ...errors import LabelError
-from ..grid import DEFAULT_NAMES, LabelMap, read_geometry
+from ...arrays import Array, Indices, Mask
+from ...errors import LabelError, add_location
+from ...folders import list_files
+from ..grid import DEFAULT_NAMES, SOFT_TISSUE, Grid, LabelMap, Volume, read_geometry
+from ..images.dicom_headers import find_functional_group, redact_errors
 
 COLOURS: Mapping[str, tuple[float, float, float]] = {
     "soft tissue": (0.85, 0.55, 0.45),
@@ -27,6 +45,13 @@ COLOURS: Mapping[str, tuple[float, float, float]] = {
     "fat": (0.98, 0.90, 0.55),
 }
 _OTHER_COLOURS = ((0.9, 0.6, 0.2), (0.4, 0.6, 0.9), (0.5, 0.8, 0.7), (0.8, 0.5, 0.6))
+CONTOUR_COLUMNS = ("label", "slice", "contour", "x_mm", "y_mm", "z_mm")
+_OFF_SLICE = 0.1  # slices: farther off, a contour was not drawn on this image
+_CONTOUR_FORMAT = "give the columns " + ",".join(CONTOUR_COLUMNS)
+SEGMENTATION = ("1.2.840.10008.5.1.4.1.1.66.4", "1.2.840.10008.5.1.4.1.1.66.7")
+_ON_SLICE = 0.01  # of the slice spacing
+_TILT_MM = 0.01
+STRUCTURE_SET = "1.2.840.10008.5.1.4.1.1.481.3"
 
 
 def get_colour(name: str, number: int) -> tuple[float, float, float]:
@@ -145,3 +170,271 @@ def flatten(masks: Sequence[Mask], names: Sequence[str]) -> tuple[NDArray[np.uin
     for n in sorted(range(len(masks)), key=lambda n: -int(masks[n].sum())):
         flat[masks[n]] = values[n]
     return flat, dict(zip(values, names))
+
+
+def rasterise_polygons(polygons: Sequence[Array], like: Grid) -> Mask:
+    """``[k, j, i]`` voxels whose centre lies inside, by even-odd; ``polygons`` (n, 3) each, LPS mm. Raises
+    `LabelError` for polygons that do not lie on the grid's slices, lie outside it, or leave slices out.
+    """
+    slices: dict[int, list[Array]] = defaultdict(list)
+    for polygon in polygons:
+        index = like.point_to_index(polygon)
+        k = round(float(index[:, 2].mean()))
+        if np.abs(index[:, 2] - k).max() > _OFF_SLICE:
+            raise LabelError(
+                "contours that do not lie on the slices of the image",
+                remedy="give the image on which they were drawn",
+            )
+        slices[k].append(index[:, :2])
+    if not slices:
+        raise LabelError("no contours", remedy="draw at least one closed contour")
+    if min(slices) < 0 or max(slices) >= like.size[2]:
+        raise LabelError("contours outside the image", remedy="give the image on which they were drawn")
+    absent = max(slices) - min(slices) + 1 - len(slices)
+    if absent:
+        raise LabelError(
+            f"{absent} slices without a contour between others",
+            remedy="interpolate the contours in the program that drew them",
+        )
+    mask = np.zeros(like.array.shape, dtype=bool)
+    for k, found in slices.items():
+        mask[k] = fill_even_odd(found, like.size[0], like.size[1])
+    return mask
+
+
+def fill_even_odd(polygons: Sequence[Array], columns: int, rows: int) -> Mask:
+    """(rows, columns) pixels whose centre (i, j) lies inside an odd number of polygons (n, 2).
+
+    Each edge that passes a row's centre line toggles all pixels to its right; an edge takes its lower end and
+    not its upper one, so that a corner on the line counts once.
+    """
+    toggles = np.zeros((rows, columns + 1), dtype=np.int64)
+    for polygon in polygons:
+        for (x0, y0), (x1, y1) in zip(polygon, np.roll(polygon, -1, axis=0)):
+            low, high = min(y0, y1), max(y0, y1)
+            j = np.arange(max(int(np.ceil(low)), 0), min(int(np.ceil(high)), rows))
+            if len(j) == 0:
+                continue
+            crossing = x0 + (j - y0) * (x1 - x0) / (y1 - y0)
+            np.add.at(toggles, (j, np.clip(np.ceil(crossing), 0, columns).astype(np.int64)), 1)
+    return np.cumsum(toggles[:, :columns], axis=1) % 2 == 1
+
+
+def find_outlines(mask: Mask) -> list[Array]:
+    """Closed polygons (n, 2) of a slice's mask ``[j, i]`` as (i, j), half-way between pixel centres."""
+    if not mask.any():
+        return []
+    padded = np.pad(mask, 1).astype(float)
+    lines = contour_generator(z=padded).lines(0.5)
+    return [np.asarray(line)[:-1] - 1.0 for line in lines]
+
+
+def write_contours(path: str | Path, labels: LabelMap) -> None:
+    """Contours of a label map: of the whole limb, named ``soft tissue``, and of each other label.
+
+    Read again on the same grid they give the same label map: where structures overlap, the smaller wins.
+    """
+    masks = {SOFT_TISSUE: labels.limb}
+    masks |= {name: labels.mask(name) for name in labels.names.values() if name != SOFT_TISSUE}
+    with Path(path).open("w", encoding="utf-8", newline="") as stream:
+        rows = csv.writer(stream)
+        rows.writerow(CONTOUR_COLUMNS)
+        for name, mask in masks.items():
+            for k in np.flatnonzero(mask.any(axis=(1, 2))):
+                for n, line in enumerate(find_outlines(mask[k])):
+                    index = np.column_stack([line, np.full(len(line), k)])
+                    points = labels.index_to_point(index)
+                    rows.writerows([name, k, n, *(f"{x:.4f}" for x in point)] for point in points)
+
+
+def read_contours(path: str | Path, like: Volume) -> LabelMap:
+    """The label map of a contour file on the grid of the image on which the contours were drawn. Raises
+    `LabelError` with the file and the line or the structure.
+    """
+    with add_location(file=path):
+        return build_labels([*_read_polygons(Path(path)).items()], like)
+
+
+def _read_polygons(path: Path) -> dict[str, list[Array]]:
+    """The contours (n, 3) of each structure of a file, LPS mm."""
+    found: dict[str, dict[tuple[int, int], list[list[float]]]] = defaultdict(lambda: defaultdict(list))
+    for line, row in _read_rows(path):
+        try:
+            name, key = normalise_name(row["label"]), (int(row["slice"]), int(row["contour"]))
+            point = [float(row[axis]) for axis in CONTOUR_COLUMNS[3:]]
+        except (TypeError, ValueError):
+            point = []
+        if not point or not np.all(np.isfinite(point)):
+            raise LabelError("not a point of a contour", place=f"line {line}", remedy=_CONTOUR_FORMAT)
+        found[name][key].append(point)
+    for name, contours in found.items():
+        short = [key for key, points in contours.items() if len(points) < 3]
+        if short:
+            raise LabelError("a contour of fewer than 3 points", place=f"{name}, slice {short[0][0]}")
+    return {name: [np.array(points) for points in contours.values()] for name, contours in found.items()}
+
+
+def build_labels(structures: Sequence[tuple[str, Sequence[Array]]], like: Grid) -> LabelMap:
+    """Structures, by name and contours (LPS mm), as a label map on the grid of ``like``. Raises `LabelError`
+    with the structure that cannot be rasterised, or for two of one name.
+    """
+    masks = []
+    for name, polygons in structures:
+        with add_location(place=name):
+            masks.append(rasterise_polygons(polygons, like))
+    array, names = flatten(masks, [name for name, _ in structures])
+    return LabelMap(array, *like.geometry, names)
+
+
+def _read_rows(path: Path) -> Iterator[tuple[int, dict[str, str]]]:
+    """Rows of the file with the number of their line."""
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as stream:
+            rows = csv.DictReader(stream)
+            if rows.fieldnames is None or any(name not in rows.fieldnames for name in CONTOUR_COLUMNS):
+                raise LabelError("not a file of contours", remedy=_CONTOUR_FORMAT)
+            for row in rows:
+                yield rows.line_num, row
+    except (OSError, UnicodeDecodeError, csv.Error):
+        raise LabelError("the contours cannot be read", remedy=_CONTOUR_FORMAT) from None
+
+
+def find_dicom_labels(path: Path) -> Path | None:
+    """The DICOM-SEG or RTSTRUCT that ``path`` is, or that is the only one in it; None for another file.
+    Raises `LabelError` for a folder without or with several of them, and for DICOM of another kind.
+    """
+    if path.is_dir():
+        found = [file for file in list_files(path) if _find_storage_class(file)]
+        if len(found) != 1:
+            raise LabelError(
+                f"{len(found) or 'no'} DICOM segmentations or structure sets in this folder",
+                remedy="name the file",
+            )
+        return found[0]
+    if not path.is_file() or not _is_dicom(path):
+        return None
+    if _find_storage_class(path) is None:
+        raise LabelError(
+            "DICOM, but no segmentation and no structure set",
+            remedy="give a DICOM-SEG or RTSTRUCT file",
+        )
+    return path
+
+
+def read_dicom_labels(path: Path, like: Volume | None) -> LabelMap:
+    """The label map of a file that :func:`find_dicom_labels` found: the segments of a DICOM-SEG by their
+    labels, on the grid of its own frames, or the structures of an RTSTRUCT by their names, on the grid of the
+    image.
+
+    Raises `LabelError` for a fractional segmentation, frames without a place or out of a stack, contours
+    without an image, or that do not lie on its slices or leave slices out, or a damaged file.
+    """
+    if _find_storage_class(path) == STRUCTURE_SET:
+        if like is None:
+            raise LabelError("contours need the image on which they were drawn")
+        with redact_errors(LabelError("the structure set is damaged", remedy="export it again")):
+            contours = _read_structures(pydicom.dcmread(path))
+        return build_labels(contours, like)
+    what = "the DICOM segmentation is damaged or cannot be decoded"
+    with redact_errors(LabelError(what, remedy="export it again")):
+        grid, masks, labels = _read_masks(pydicom.dcmread(path))
+        array, names = flatten(masks, [normalise_name(label) for label in labels])
+    return LabelMap(array, *grid.geometry, names)
+
+
+def _is_dicom(path: Path) -> bool:
+    with path.open("rb") as stream:
+        return stream.read(132)[128:] == b"DICM" or path.suffix.lower() == ".dcm"
+
+
+def _find_storage_class(path: Path) -> str | None:
+    """The storage class, if it is one of a label map."""
+    with redact_errors(LabelError("a damaged DICOM file", remedy="export it again")):
+        try:
+            kind = str(pydicom.dcmread(path, specific_tags=["SOPClassUID"]).get("SOPClassUID", ""))
+        except (InvalidDicomError, OSError):
+            return None
+    return kind if kind in (*SEGMENTATION, STRUCTURE_SET) else None
+
+
+def _read_masks(data: FileDataset) -> tuple[Grid, list[Mask], list[str]]:
+    """The smallest grid that holds all frames, and a mask on it and the label of each segment.
+
+    A label map may describe its background as a segment, too (``PixelPaddingValue``): that is none.
+    """
+    kind = str(data.get("SegmentationType", ""))
+    if kind not in ("BINARY", "LABELMAP"):
+        raise LabelError("a fractional segmentation", remedy="export a binary one")
+    shared = data.SharedFunctionalGroupsSequence[0]
+    groups = [(group, shared) for group in data.PerFrameFunctionalGroupsSequence]
+    pixels = data.pixel_array.reshape(len(groups), data.Rows, data.Columns)
+    grid, slices = _stack_frames(groups, pixels.shape[1:])
+    labels = {int(segment.SegmentNumber): segment.SegmentLabel for segment in data.SegmentSequence}
+    if kind == "LABELMAP":
+        labels.pop(int(data.get("PixelPaddingValue", 0)), None)
+    masks = {number: np.zeros(grid.array.shape, dtype=bool) for number in labels}
+    for group, plane, k in zip(groups, pixels, slices, strict=True):
+        if kind == "BINARY":
+            identity = find_functional_group(group, "SegmentIdentificationSequence")
+            plane = np.where(plane > 0, int(identity.ReferencedSegmentNumber), 0)
+        for number, mask in masks.items():
+            mask[k] |= plane == number
+    return grid, list(masks.values()), list(labels.values())
+
+
+def _stack_frames(groups: list[tuple[Dataset, Dataset]], shape: tuple[int, ...]) -> tuple[Grid, Indices]:
+    """The grid of frames with these functional groups and a shape (rows, columns), and the slice of each."""
+    orientations, positions = (
+        np.array([getattr(find_functional_group(group, sequence), name) for group in groups], dtype=float)
+        for sequence, name in (
+            ("PlaneOrientationSequence", "ImageOrientationPatient"),
+            ("PlanePositionSequence", "ImagePositionPatient"),
+        )
+    )
+    if np.abs(orientations - orientations[0]).max() > 1e-4:
+        raise LabelError("frames of several orientations", remedy="export one for each orientation")
+    measures = find_functional_group(groups[0], "PixelMeasuresSequence")
+    stated = (measures.get("SpacingBetweenSlices"), measures.get("SliceThickness"))
+    rows, columns = orientations[0, :3], orientations[0, 3:]
+    normal = np.cross(rows, columns)
+    heights = positions @ normal
+    first = positions[np.argmin(heights)]
+    sideways = positions - first - np.outer(heights - heights.min(), normal)
+    spacing = _find_slice_spacing(heights, tuple(float(s) for s in stated if s))
+    if np.abs(sideways).max() > _TILT_MM or spacing is None:
+        raise LabelError("frames that are no stack of slices", remedy="export it with the image as reference")
+    index = np.rint((heights - heights.min()) / spacing).astype(np.int64)
+    pixel = np.array(measures.PixelSpacing, dtype=float)
+    grid = Grid(
+        np.zeros((index.max() + 1, *shape), np.uint8),
+        np.array([pixel[1], pixel[0], spacing]),
+        first,
+        np.column_stack([rows, columns, normal]),
+    )
+    return grid, index
+
+
+def _find_slice_spacing(heights: Array, header_mm: tuple[float, ...]) -> float | None:
+    """A step of which all distances between frames are multiples: the header's, or the smallest gap."""
+    above = heights - heights.min()
+    gaps = np.diff(np.unique(above))
+    for step in (*header_mm, *gaps[gaps > 1e-3 * max(header_mm, default=1.0)][:1]):
+        off = np.abs(above / step - np.rint(above / step)).max()
+        if step > 0 and off <= _ON_SLICE:
+            return float(step)
+    return None
+
+
+def _read_structures(data: FileDataset) -> list[tuple[str, list[Array]]]:
+    """Each structure's name and closed contours, LPS mm; structures without any are left out."""
+    names = {int(roi.ROINumber): normalise_name(roi.ROIName) for roi in data.StructureSetROISequence}
+    found: dict[int, list[Array]] = {}
+    for item in data.ROIContourSequence:
+        closed = [
+            np.array(contour.ContourData, dtype=float).reshape(-1, 3)
+            for contour in item.get("ContourSequence") or []
+            if str(contour.ContourGeometricType) in ("CLOSED_PLANAR", "CLOSEDPLANAR_XOR")
+        ]
+        if closed:
+            found.setdefault(int(item.ReferencedROINumber), []).extend(closed)
+    return [(names[number], closed) for number, closed in found.items()]

@@ -18,7 +18,7 @@ import numpy as np
 
 from ...arrays import Array, Indices, Mask
 from ...mesh import TET10_EDGES, compute_dihedral_angles
-from ...mesh.boxes import SIX_TETS
+from ...mesh.cells import SIX_TETS
 
 Field = Callable[[Array], tuple[Array, Array]]
 
@@ -93,19 +93,14 @@ def compute_volumes(points: Array, tets: Indices) -> Array:
 def cut(
     grid: TetGrid, field: Field, bit: int, slack: float = 0.0, region: int | None = None
 ) -> tuple[TetGrid, Mask]:
-    """Cut a grid along ``field = 0``.
+    """Cut a grid along ``field = 0``; also say which of its tetrahedra lie where the field is positive.
 
     Parameters
     ----------
-    grid : the grid.
     field : signed function of points (k, 3) that gives values (k,) and gradients (k, 3).
     bit : mask bit that the points on the level set receive.
     slack : as for :func:`compute_in_band`.
     region : of the tetrahedra that are cut; others are divided where they share an edge. None: all.
-
-    Returns
-    -------
-    The cut grid and, per tetrahedron that was to be cut, whether it lies where the field is positive.
     """
     values = compute_in_band(field, grid.points, LONGEST_EDGE * grid.spacing, grid.spacing, slack)
     chosen = grid.tets if region is None else grid.tets[grid.regions == region]

@@ -48,10 +48,8 @@ class VolumeMesh:
 class VolumeTask(VolumeMesh):
     """A tetrahedral mesh to be adapted to a size; faces between two regions are kept.
 
-    Attributes
-    ----------
-    size : (n,) requested edge length at the points, mm.
-    hausdorff_mm : how far the new surface may stray from the old one.
+    ``size`` (n,) is the requested edge length at the points, mm, ``hausdorff_mm`` how far the new surface may
+    stray from the old one.
     """
 
     size: Array

@@ -1,5 +1,7 @@
 """Implicit fields of a limb: depth below the skin, distance to the bones, the layers and trimmed bone.
 
+A liner is one more layer, outside the skin.
+
 Vocabulary
 ----------
 limb frame  the proximal cut is the plane z = 0 and the limb lies at z <= 0; millimetres.
@@ -19,14 +21,15 @@ from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
+import pyvista as pv
 
 from ...arrays import Array
 from ...errors import SurfaceError
 from ...results.limb import BoneLoss, SkinLoss
-from ..frame import Frame
-from ..surfaces.surfaces import END_TOLERANCE_MM, Anatomy, check_cut
+from ..grid import Frame
+from ..surfaces.surfaces import END_TOLERANCE_MM, Anatomy, check_cut, cut_and_cap
 from ..surfaces.thickness import SLOPE, limit_slope, transfer_values
-from ..surfaces.triangles import Surface, cross_edges, find_open_edges, from_pyvista
+from ..surfaces.triangles import Surface, cross_edges, find_bodies, find_open_edges, from_pyvista
 
 Level = tuple[Array, Array]  # a signed function at points and its gradient there
 
@@ -35,6 +38,9 @@ SEAM_MM = 3.0  # below the cut, where surfaces are prolonged from
 NORMAL_WITHIN_MM = 1e-3  # of a surface, where its normal stands for the gradient of the distance
 TRIM_SAMPLES = 60_000
 MIN_LAYER_SHARE = 1 / 3  # of the layers' thickness, below which ``thin-skin`` trims bone instead
+
+LINER_SPACING_MM = 3.0  # of the grid on which the surface is contoured
+LINER_EDGE_MM = 4.0  # of its triangles
 
 BonePolicy = Literal["trim-bone", "thin-skin"]
 
@@ -119,11 +125,8 @@ class LimbFields:
             value[candidates[nearer]], gradient[candidates[nearer]] = distance[nearer], slope[nearer]
         return value, gradient
 
-    def measure_trimmed_bones(self) -> dict[str, BoneLoss]:
-        """What trimming took from each bone."""
-        return {name: self._measure_trimmed_bone(bone) for name, bone in self.bones.items()}
-
-    def _measure_trimmed_bone(self, bone: Surface) -> BoneLoss:
+    def measure_trimmed_bone(self, bone: Surface) -> BoneLoss:
+        """What trimming took from a bone."""
         below = bone.points[bone.points[:, 2] <= 0.0]
         excess = self.bone_clearance_mm - self.layer(below)[0] if len(below) else np.zeros(0)
         shallow = below[excess > 0]
@@ -151,6 +154,9 @@ def build_limb_fields(
 ) -> LimbFields:
     """The fields of an anatomy.
 
+    Raises `SurfaceError` when the skin does not reach the cut plane, or the fat's depth is needed and not
+    given.
+
     Parameters
     ----------
     anatomy : closed skin and bones.
@@ -159,11 +165,6 @@ def build_limb_fields(
     policy : what gives way where bone is shallower, the bone or the layers.
     fat_depth_mm : (n,) depth of the fat's inner face at the vertices of the anatomy's skin, for a layer
         without a thickness of its own.
-
-    Raises
-    ------
-    SurfaceError
-        When the skin does not reach the cut plane, or the fat's depth is needed and not given.
     """
     check_cut(anatomy)
     frame = anatomy.frame
@@ -260,3 +261,45 @@ def sample_box(low: Array, high: Array, spacing: float) -> Array:
     counts = np.maximum(1, np.round((high - low) / spacing)).astype(int)
     axes = [lo + (np.arange(n) + 0.5) * (hi - lo) / n for lo, hi, n in zip(low, high, counts)]
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+
+
+def build_liner_surface(
+    anatomy: Anatomy, thickness_mm: float, fat_depth_mm: Array | None = None
+) -> tuple[Anatomy, Array | None]:
+    """The anatomy whose outer surface is a liner's, everywhere ``thickness_mm`` outside the skin.
+
+    Meshed as the outermost layer, the liner leaves the skin where it was. ``fat_depth_mm`` (n,) is the depth
+    of the fat's inner face below the vertices of the skin; also return it below those of the outer surface.
+    """
+    frame = anatomy.frame
+    skin = Surface(frame.to_limb(anatomy.skin.points), anatomy.skin.faces)
+    long = prolong_surface(skin)
+    liner = cut_and_cap(
+        _extract_offset_surface(long, thickness_mm), np.zeros(3), np.array([0.0, 0.0, 1.0]), LINER_EDGE_MM
+    )
+    below = np.flatnonzero(liner.points[:, 2] < -LINER_EDGE_MM / 10)
+    points = liner.points.copy()
+    points[below] = _project_to_offset(long, points[below], thickness_mm)
+    liner = replace(liner, points=points)
+    depth = None
+    if fat_depth_mm is not None:
+        depth = transfer_values(skin, fat_depth_mm[None], liner.points)[0] + thickness_mm
+    return replace(anatomy, skin=Surface(frame.to_patient(liner.points), liner.faces)), depth
+
+
+def _extract_offset_surface(surface: Surface, distance_mm: float) -> Surface:
+    """A level of the distance outside a closed surface; where that is concave it keeps clear of itself."""
+    pad = distance_mm + 2.0 * LINER_SPACING_MM
+    low, high = surface.points.min(axis=0) - pad, surface.points.max(axis=0) + pad
+    size = np.ceil((high - low) / LINER_SPACING_MM).astype(int) + 1
+    grid = pv.ImageData(dimensions=size, spacing=[LINER_SPACING_MM] * 3, origin=low)
+    grid.point_data["distance"] = evaluate_distance(surface, np.asarray(grid.points))[0]
+    found = grid.contour([distance_mm], scalars="distance", method="flying_edges", compute_normals=False)
+    outer = find_bodies(from_pyvista(found.clean()))[0].outward
+    return Surface(_project_to_offset(surface, outer.points, distance_mm), outer.faces)
+
+
+def _project_to_offset(surface: Surface, points: Array, distance_mm: float) -> Array:
+    """Points (n, 3) near a surface's offset, put on it."""
+    distance, slope = evaluate_distance(surface, points)
+    return np.asarray(points + (distance_mm - distance)[:, None] * slope)

@@ -9,7 +9,7 @@ The recipe
 3. Nodes of layer, bones and regions are put on their smooth surfaces; the skin layer is extruded from the
    interface to the skin, each node to its nearest skin point: its thickness is uniform by construction.
 4. Quadratic elements: promoted straight-sided, then curved to the smooth surfaces where they stay sound;
-   faces that are too coarse to follow a bone are put on it in the mean (`curving`).
+   faces that are too coarse to follow a bone are put on it in the mean (`improving`).
 """
 
 import time
@@ -26,31 +26,12 @@ from ...errors import MeshingError, ProblemError
 from ...mesh import Mesh, boundary_faces, check, node_jacobians, to_tet10
 from ...results.limb import BoneLoss, MeshMeasures
 from ..surfaces.surfaces import Anatomy
-from . import background
+from . import background, improving, regions
 from .background import BONE, LAYER, PLANE, REGION, TetGrid, compute_volumes, project_safely, project_to_level
-from .curving import balance_bone_faces, compute_curved_target, curve_diagonals, curve_mesh
 from .engines import ENGINES, MesherError, VolumeMesh, VolumeTask
 from .extrusion import build_core_mesh, extrude_layers
 from .layers import BonePolicy, LayerSpec, LimbFields, build_limb_fields, evaluate_distance
 from .meshreport import GOOD_DIHEDRAL_DEG, compute_enclosed_volume, measure_mesh
-from .regions import (
-    build_region_level,
-    check_regions,
-    compute_region_volumes,
-    cut_at_regions,
-    find_interfaces,
-    measure_thickness,
-    mesh_numbers,
-    refine_at_regions,
-)
-from .smoothing import smooth_elements
-from .untangling import (
-    describe_narrowest_gap,
-    describe_unrepaired,
-    find_inverted_cells,
-    repair_mesh,
-    untangle_cells,
-)
 
 SURFACES = (PLANE, LAYER, BONE)
 HAUSDORFF_RADIUS_MM = 250.0  # MMG takes edges of sqrt(9/2 hausdorff R) on a surface of radius R
@@ -119,19 +100,14 @@ class BaseMesh:
 def build_base_mesh(anatomy: Anatomy, settings: MeshSettings, fat_depth_mm: Array | None = None) -> BaseMesh:
     """The part of meshing that does not depend on the site.
 
+    Raises `SurfaceError` when the skin does not reach the cut plane, the fat's depth is needed and not given,
+    or a region cannot be meshed; `MeshingError` when nothing is left between layer, bones and cut.
+
     Parameters
     ----------
     anatomy, settings : as for :func:`mesh_site`.
     fat_depth_mm : (n,) depth of the fat's inner face at the vertices of the anatomy's skin, for a layer
-        without a thickness of its own (:func:`limbfit.anatomy.surfaces.thickness.fat_depth`).
-
-    Raises
-    ------
-    SurfaceError
-        When the skin does not reach the cut plane, the fat's depth is needed and not given, or a region
-        cannot be meshed.
-    MeshingError
-        When nothing is left between layer, bones and cut.
+        without a thickness of its own (:func:`limbfit.anatomy.surfaces.thickness.measure_fat_depth`).
     """
     fields = build_limb_fields(
         anatomy, settings.layers, settings.bone_clearance_mm, settings.bone_policy, fat_depth_mm
@@ -139,19 +115,19 @@ def build_base_mesh(anatomy: Anatomy, settings: MeshSettings, fat_depth_mm: Arra
     spacing = settings.base_spacing_mm
     low = fields.skin.points.min(axis=0) - spacing
     high = fields.skin.points.max(axis=0) + spacing
-    check_regions(fields, settings.edge_near_mm)
+    regions.check_regions(fields, settings.edge_near_mm)
     grid = background.build_box_grid(low, np.array([*high[:2], 0.0]), spacing)
-    grid = refine_at_bones(refine_at_regions(grid, fields), fields)
+    grid = refine_at_bones(regions.refine_at_regions(grid, fields), fields)
     for level, bit in ((fields.layer, LAYER), (fields.void, BONE)):
         grid, positive = background.cut(grid, level, bit, fields.floor_range_mm)
         grid = grid.select(positive)
         if not len(grid.tets):
             raise MeshingError(f"no {settings.core} is left under the layers; choose thinner layers")
-    grid = cut_at_regions(grid, fields)
-    trimmed = fields.measure_trimmed_bones()
+    grid = regions.cut_at_regions(grid, fields)
+    trimmed = {name: fields.measure_trimmed_bone(bone) for name, bone in fields.bones.items()}
     limit = compute_size_limit(fields, grid, settings)
     enclosed = compute_enclosed_volume(anatomy, fields, trimmed)
-    return BaseMesh(fields, grid, limit, trimmed, enclosed, compute_region_volumes(fields))
+    return BaseMesh(fields, grid, limit, trimmed, enclosed, regions.compute_region_volumes(fields))
 
 
 def refine_at_bones(grid: TetGrid, fields: LimbFields) -> TetGrid:
@@ -195,6 +171,9 @@ def mesh_site(
 ) -> tuple[Mesh, MeshMeasures]:
     """A conforming mesh graded about an indentation site.
 
+    Raises `MeshingError` when the mesher fails, or its mesh has inverted elements that cannot be mended:
+    where and why.
+
     Parameters
     ----------
     anatomy : closed skin and bones, LPS mm.
@@ -208,11 +187,6 @@ def mesh_site(
     mesh : regions named as the layers, the anatomy's regions and the core; node sets ``fixed_bone`` (on
         bones) and ``fixed_proximal`` (on the cut plane); face set ``skin`` (outward, without the cut plane).
     measures : its quality and what was trimmed.
-
-    Raises
-    ------
-    MeshingError
-        When the mesher fails, or its mesh has inverted elements that cannot be mended: where and why.
     """
     base = base or build_base_mesh(anatomy, settings)
     frame = base.fields.frame
@@ -226,11 +200,8 @@ def mesh_limb(
 ) -> tuple[Mesh, MeshMeasures]:
     """A mesh of the whole limb, as for :func:`mesh_site`, that is fine all around it.
 
-    Parameters
-    ----------
-    anatomy, settings, fat_depth_mm : as for :func:`build_base_mesh`; edges are of ``edge_near_mm`` under the
-        layers and grow with the depth below them.
-    fine_to_mm : distance from the proximal cut up to which they are; nearer to it they grow.
+    Edges are of ``edge_near_mm`` under the layers and grow with the depth below them, and nearer to the
+    proximal cut than ``fine_to_mm``.
     """
     base = build_base_mesh(anatomy, settings, fat_depth_mm)
     return _mesh_base(base, compute_limb_size(base, fine_to_mm, settings), settings)
@@ -247,20 +218,20 @@ def _mesh_base(
     try:
         core = ENGINES[settings.engine](task, settings.time_limit_s)
     except MesherError as error:  # as a rule where its input is flattest
-        where = describe_narrowest_gap(task.points, task.tets, fields)
+        where = improving.describe_narrowest_gap(task.points, task.tets, fields)
         raise MeshingError(f"{error}; its input is flattest {where}") from None
     core = _snap_nodes(core, fields)
     names = (*(layer.name for layer in settings.layers), *fields.regions, settings.core)
     mesh, stack = extrude_layers(core, fields, names)
-    mesh = smooth_elements(mesh, fields, stack)
-    mesh, repairs = repair_mesh(mesh, fields, stack)
-    if settings.element == "tet10" and not find_inverted_cells(mesh).any():
+    mesh = improving.smooth_elements(mesh, fields, stack)
+    mesh, repairs = improving.repair_mesh(mesh, fields, stack)
+    if settings.element == "tet10" and not improving.find_inverted_cells(mesh).any():
         mesh = to_tet10(mesh)
         if settings.curved:
             straight = node_jacobians(mesh).min(axis=1)
-            target = curve_diagonals(mesh, compute_curved_target(mesh, fields), stack)
-            mesh = curve_mesh(mesh, target, straight)
-            mesh = balance_bone_faces(mesh, fields, straight)
+            target = improving.curve_diagonals(mesh, improving.compute_curved_target(mesh, fields), stack)
+            mesh = improving.curve_mesh(mesh, target, straight)
+            mesh = improving.balance_bone_faces(mesh, fields, straight)
     _check_usable(mesh, fields)
     measures = measure_mesh(
         mesh,
@@ -278,10 +249,9 @@ def _mesh_base(
 
 
 def _check_usable(mesh: Mesh, fields: LimbFields) -> None:
-    if find_inverted_cells(mesh).any():
-        raise MeshingError(
-            f"{describe_unrepaired(mesh, fields)}; smooth the surface there, or choose smaller edges"
-        )
+    if improving.find_inverted_cells(mesh).any():
+        where = improving.describe_unrepaired(mesh, fields)
+        raise MeshingError(f"{where}; smooth the surface there, or choose smaller edges")
     try:
         check(mesh)
     except ProblemError as error:
@@ -325,8 +295,8 @@ def compute_size_limit(fields: LimbFields, grid: TetGrid, settings: MeshSettings
     thinnest = np.diff(depths, axis=0, prepend=0.0).min(axis=0)
     limit = np.minimum(LAYER_RATIO * settings.flatness * thinnest + under_layers, over_bone)
     for number in range(len(fields.regions)):
-        away = evaluate(build_region_level(fields, number))
-        edge = max(REGION_RATIO * measure_thickness(fields, number), settings.edge_near_mm)
+        away = evaluate(regions.build_region_level(fields, number))
+        edge = max(REGION_RATIO * regions.measure_thickness(fields, number), settings.edge_near_mm)
         limit = np.minimum(limit, edge + np.maximum(away, 0.0))
     return limit
 
@@ -336,8 +306,8 @@ def _build_task(grid: TetGrid, size: Array, settings: MeshSettings) -> VolumeTas
     common = np.bitwise_and.reduce(grid.mask[triangles], axis=1)
     surfaces = np.select([common & bit > 0 for bit in SURFACES], SURFACES, BONE)
     count = int(grid.regions.max())
-    numbers = mesh_numbers(grid.regions, 0, count)
-    inner = find_interfaces(
+    numbers = regions.mesh_numbers(grid.regions, 0, count)
+    inner = regions.find_interfaces(
         Mesh(grid.points, grid.tets, "tet4", numbers, tuple(map(str, range(count + 1)))), 0
     )
     refs = [np.full(len(faces), REGION << number) for number, faces in enumerate(inner)]
@@ -358,10 +328,9 @@ def _snap_nodes(core: VolumeMesh, fields: LimbFields) -> VolumeMesh:
     target = core.points.copy()
     target[in_plane, 2] = 0.0
     free = np.where(in_plane, 0.0, 1.0)
-    regions = [
-        (REGION << number, build_region_level(fields, number)) for number in range(len(fields.regions))
-    ]
-    for surface, level in (*regions, (BONE, fields.void), (LAYER, fields.layer)):
+    numbers = range(len(fields.regions))
+    inner = [(REGION << number, regions.build_region_level(fields, number)) for number in numbers]
+    for surface, level in (*inner, (BONE, fields.void), (LAYER, fields.layer)):
         nodes = np.flatnonzero(_find_nodes_on(core, surface))
         target[nodes] = project_to_level(level, target[nodes], free[nodes])
     points = project_safely(core.points, target, core.tets, GOOD_DIHEDRAL_DEG)
@@ -382,7 +351,7 @@ def _recover_interface(points: Array, target: Array, core: VolumeMesh, fields: L
     inner[core.triangles] = False
     moved = points.copy()
     moved[stray] = target[stray]
-    moved = untangle_cells(moved, core.tets, np.zeros_like(moved), inner)
+    moved = improving.untangle_cells(moved, core.tets, np.zeros_like(moved), inner)
     return moved if (compute_volumes(moved, core.tets) > 0.0).all() else points
 
 

@@ -14,8 +14,7 @@ from scipy.ndimage import distance_transform_edt, gaussian_filter, map_coordinat
 
 from ...arrays import Array, Mask
 from ...errors import LabelError
-from ..frame import find_proximal_end
-from ..grid import SOFT_TISSUE, Grid, LabelMap
+from ..grid import SOFT_TISSUE, Grid, LabelMap, find_proximal_end
 from ..morphology import find_largest_piece
 from ..surfaces.extraction import compute_signed_distance_to
 from ..surfaces.surfaces import Anatomy, build_anatomy, normalise_plane
@@ -39,6 +38,11 @@ def amputate_limb(
 ) -> LabelMap:
     """The leg cut at a plane, with a rounded pad of soft tissue over the cut bones.
 
+    Bones and soft tissue distal of the pad are gone. Slices thicker than 1.5 mm are divided evenly, with the
+    shape of each label interpolated, so that the end is round and not a stair. Raises `LabelError` for a
+    plane that misses the limb, lies along it, points distally or cuts no bone off, or an image too short for
+    the pad; `SurfaceError` for a normal of no length.
+
     Parameters
     ----------
     labels : an intact leg.
@@ -46,18 +50,6 @@ def amputate_limb(
     pad_mm : soft tissue distal of the bones, on the limb's middle; towards the outline it thins as a
         quarter ellipse.
     proximal : (3,) LPS, where proximal is; by default as :func:`find_proximal_end` finds it.
-
-    Returns
-    -------
-    LabelMap
-        Bones and soft tissue distal of the pad are gone. Slices thicker than 1.5 mm are divided evenly, with
-        the shape of each label interpolated, so that the end is round and not a stair.
-
-    Raises
-    ------
-    LabelError
-        For a plane that misses the limb, lies along it, points distally or cuts no bone off, or an image too
-        short for the pad; `SurfaceError` for a normal of no length.
     """
     point, normal = normalise_plane(plane_point, plane_normal)
     if pad_mm <= 0:
@@ -189,19 +181,13 @@ def _check_room(array: NDArray[np.uint8], section: _Section, height: Array, pad:
 def amputate_anatomy(
     anatomy: Anatomy, plane_point: ArrayLike, plane_normal: ArrayLike, pad_mm: float, edge_mm: float
 ) -> Anatomy:
-    """An anatomy cut at a plane, with a pad over the cut bones; see :func:`amputate_limb`.
+    """An anatomy cut at a plane, with a pad over the cut bones. Raises as :func:`amputate_limb`.
 
     Parameters
     ----------
     anatomy : closed surfaces of a whole limb.
-    plane_point, plane_normal : LPS mm; the normal points proximally, to what is kept.
-    pad_mm : soft tissue distal of the bones.
+    plane_point, plane_normal, pad_mm : as for :func:`amputate_limb`.
     edge_mm : edge length of the new triangles.
-
-    Raises
-    ------
-    LabelError
-        For a plane that misses the limb, lies along it, points distally or cuts no bone off.
     """
     voxels = voxelise_anatomy(anatomy, pad_mm + _MARGIN_MM)
     labels = amputate_limb(voxels, plane_point, plane_normal, pad_mm, anatomy.cut_normal)

@@ -1,39 +1,38 @@
-"""The limb in the image: whether it is one, its outline without supports, bias field and muscle's grey level.
+"""The limb in the image: whether it is one, its outline without supports, bias field, muscle and fat.
+
+T1 and UTE images are alike, by grey levels relative to muscle. CT has Hounsfield units.
 
 Supports are tables and cushions that touch the limb. Such a slab is thinner than the limb. Opened by a ball
 wider than it, the mask keeps the limb and loses the slab but for the strip under the limb; what is lost and
 reaches far out is slab, and the hull of both its wings closes the strip between them.
+
+Subcutaneous fat is what is bright and joined to the skin over more than a thin septum. The skin itself
+belongs to it, as in the skin–adipose layer of the model. Marrow, fat between muscles and the septa of fat
+that reach in from the skin do not.
 """
+
+from typing import Literal
 
 import numpy as np
 import SimpleITK as sitk  # noqa: N813
-from scipy.ndimage import (
-    binary_closing,
-    binary_fill_holes,
-    binary_opening,
-    distance_transform_edt,
-    find_objects,
-    gaussian_filter,
-)
-from scipy.ndimage import label as connected
+from scipy import ndimage
 from scipy.spatial import ConvexHull, QhullError
 
 from ...arrays import Array, Mask
 from ...errors import ImageError
-from ..frame import find_longest_axis
-from ..grid import Grid, Volume, resample_cubic
-from ..labels.contours import fill_even_odd
-from ..morphology import (
-    Field,
-    close_mask,
-    erode_mask,
-    fill_slices,
-    find_box,
-    find_largest_piece,
-    find_local_maximum,
-    open_mask,
-)
+from .. import morphology
+from ..grid import Grid, Volume, find_longest_axis, resample_cubic
+from ..labels.labelfiles import fill_even_odd
+from ..morphology import Field, find_box, find_largest_piece
 
+Contrast = Literal["auto", "T1", "UTE", "CT"]
+
+AIR_HU = -1000.0
+_LIGHTEST_HU = -200.0  # every CT of a limb shows something lighter than fat
+_DENSEST_AIR_HU = -400.0  # no air is denser, where a grey-value window cut it off
+_AIR_WIDTH_HU = 100.0  # half the width of its peak in the histogram
+_AIR_SHARE = 0.03  # of the voxels: fewer are an artefact of resampling
+_TOP_HU = 100.0  # for the outline bone and soft tissue are the same
 _SMOOTH_MM = 0.6
 _TISSUE_SHARE = 0.45  # of the median of the tissue: between the noise of air and muscle
 _CLOSE_MM = 3.5
@@ -53,12 +52,68 @@ _SMALLEST_MM2 = 700.0
 _MAX_ELONGATION = 2.5  # a cross-section is rounder than this; a limb cut lengthwise is not
 _TWO_LIMBS_SHARE = 0.3  # of the slices with a cross-section
 _MIN_SLICES = 8  # slices
+SKIN_MM = 1.5  # skin is darker than fat; so deep everything counts as skin
+SEPTUM_MM = 1.5  # sheets of fat thinner than twice this are septa
+_VESSEL_MM2 = 60.0  # cross-section of the largest vessel in the fat
+FAT_HU = (-200.0, -25.0)
+_MIN_FAT_LEVEL = 1.5  # of muscle: fat is at least this bright
+_USUAL_FAT_LEVEL = 2.0  # where nothing tells how bright fat is
+_RIND_MM = 20.0  # tissue so near to the skin shows both fat and muscle
+_NEAR_MM, _NEAR_STEP_MM = 14.0, 8.0  # half the edge of a neighbourhood, and how far apart they are
+_LOW, _HIGH = 25, 93  # percentiles between which the level is looked for
+_ROUNDS = 10
+_MIN_SAMPLES = 50  # samples in a neighbourhood
+_SAMPLE_MM = 2.5
+_NOISE_MM = 0.9
+
+
+def is_ct(volume: Volume, expected: Contrast = "auto") -> bool:
+    """True if an image has Hounsfield units, by its DICOM modality or else the peak of air in its histogram.
+
+    Without a modality an expected ``CT`` needs no such peak, only grey values below those of fat. Raises
+    `ImageError` for a constant image, a CT without Hounsfield units, or one that contradicts ``expected``.
+    """
+    low, high = float(volume.array.min()), float(volume.array.max())
+    if high <= low:
+        raise ImageError("the image is constant", remedy="check the series")
+    if volume.modality in ("CT", "MR"):
+        found, evidence = volume.modality == "CT", f"the DICOM modality {volume.modality} does"
+    else:
+        found = _has_air_peak(volume, low) or (expected == "CT" and low < _LIGHTEST_HU)
+        evidence = f"the grey values, {low:.0f} to {high:.0f}, do"
+    if expected != "auto" and found != (expected == "CT"):
+        raise ImageError(
+            f"{evidence} not fit {expected}",
+            remedy='check the series, or give segmentation.contrast = "auto"',
+        )
+    if found and low > _LIGHTEST_HU:
+        raise ImageError(
+            f"the grey values of this CT, {low:.0f} to {high:.0f}, are not Hounsfield units",
+            remedy="export the original series again",
+        )
+    return found
+
+
+def _has_air_peak(volume: Volume, low: float) -> bool:
+    """True if the histogram has a peak at -1000, or at the end of a grey-value window.
+
+    Resampling of MRI by B-splines overshoots to negative values too, but in few voxels, the fewer the lower.
+    """
+    air = max(low, AIR_HU)
+    span = (air - _AIR_WIDTH_HU, air + _AIR_WIDTH_HU)
+    count = int(np.histogram(volume.array, bins=1, range=span)[0][0])
+    return air < _DENSEST_AIR_HU and count > _AIR_SHARE * volume.array.size
+
+
+def rescale_above_air(volume: Volume) -> Volume:
+    """A CT image as an MRI-like one for the outline: air 0, soft tissue about 1000, bone no brighter."""
+    return volume.with_array(np.clip(volume.array, AIR_HU, _TOP_HU) - AIR_HU)
 
 
 def smooth_image(volume: Volume) -> Field:
     """The image without its finest noise: a Gaussian of 0.6 mm, at most 0.6 voxels."""
     sigma = np.minimum(_SMOOTH_MM / volume.spacing[::-1], 0.6)
-    return gaussian_filter(volume.array, sigma)
+    return ndimage.gaussian_filter(volume.array, sigma)
 
 
 def find_limb_axis(volume: Volume) -> int:
@@ -89,8 +144,8 @@ def _find_outline(body: Mask, smooth: Field, darkest: float, volume: Volume) -> 
     rough = find_largest_piece(remove_supports(_fill_limb(body, volume), volume))
     if rough.sum() * volume.voxel_mm3 < _SMALLEST_LIMB_MM3:
         raise ImageError("no limb was found in the image", remedy="check the series and its contrast")
-    half = 0.5 * find_local_maximum(smooth, _RIM_MM, volume.spacing)
-    core = erode_mask(rough, _RIM_MM, volume.spacing)
+    half = 0.5 * morphology.find_local_maximum(smooth, _RIM_MM, volume.spacing)
+    core = morphology.erode_mask(rough, _RIM_MM, volume.spacing)
     return find_largest_piece(_fill_limb(core | (rough & (smooth > np.maximum(half, darkest))), volume))
 
 
@@ -103,8 +158,8 @@ def _compute_otsu_threshold(array: Field) -> float:
 
 def _fill_limb(mask: Mask, volume: Volume) -> Mask:
     """Close a mask over dark skin and bone, fill it slice by slice and take its spikes off."""
-    filled = fill_slices(close_mask(mask, _CLOSE_MM, volume.spacing))
-    return fill_slices(open_mask(filled, _OPEN_MM, volume.spacing))
+    filled = morphology.fill_slices(morphology.close_mask(mask, _CLOSE_MM, volume.spacing))
+    return morphology.fill_slices(morphology.open_mask(filled, _OPEN_MM, volume.spacing))
 
 
 def estimate_bias_field(volume: Volume, limb: Mask) -> Field:
@@ -140,7 +195,7 @@ def remove_supports(mask: Mask, grid: Grid) -> Mask:
     wings = _find_wings(coarse & ~body, body, sampling)
     if not wings.any():
         return mask
-    strip = _compute_hulls(wings) & (distance_transform_edt(body, sampling=sampling) < _STRIP_MM)
+    strip = _compute_hulls(wings) & (ndimage.distance_transform_edt(body, sampling=sampling) < _STRIP_MM)
     support = wings | strip
     for axis, step in enumerate(steps):
         support = np.repeat(support, step, axis=axis)
@@ -152,18 +207,18 @@ def _open_limb(mask: Mask, sampling: Array) -> Mask:
     reach = np.ceil(2 * BALL_MM / sampling).astype(int) + 1
     padded = np.pad(mask, [(reach[0], reach[0]), (0, 0), (0, 0)], mode="edge")
     padded = np.pad(padded, [(0, 0), (reach[1], reach[1]), (reach[2], reach[2])])
-    inner = distance_transform_edt(padded, sampling=sampling) > BALL_MM
-    opened = distance_transform_edt(~inner, sampling=sampling) <= BALL_MM
+    inner = ndimage.distance_transform_edt(padded, sampling=sampling) > BALL_MM
+    opened = ndimage.distance_transform_edt(~inner, sampling=sampling) <= BALL_MM
     return np.asarray(opened[tuple(slice(r, -r) for r in reach)]) & mask
 
 
 def _find_wings(residue: Mask, body: Mask, sampling: Array) -> Mask:
     """Pieces of the residue that stick far out of the body along much of it."""
-    away = distance_transform_edt(~body, sampling=sampling)
+    away = ndimage.distance_transform_edt(~body, sampling=sampling)
     length = np.ptp(np.flatnonzero(body.any(axis=(1, 2)))) + 1 if body.any() else 1
-    parts, _ = connected(residue, np.ones((3, 3, 3)))
+    parts, _ = ndimage.label(residue, np.ones((3, 3, 3)))
     wings = np.zeros(residue.shape, dtype=bool)
-    for value, box in enumerate(find_objects(parts), start=1):
+    for value, box in enumerate(ndimage.find_objects(parts), start=1):
         piece = parts[box] == value
         far = piece & (away[box] > _REACH_MM)
         beside = far.any(axis=(1, 2)) & body[box[0]].any(axis=(1, 2))  # else it is a thin end of the limb
@@ -188,12 +243,8 @@ def _compute_hulls(wings: Mask) -> Mask:
 
 
 def check_one_limb(volume: Volume) -> None:
-    """Refuse an image whose slices across some axis show two large, roundish sections side by side.
-
-    Raises
-    ------
-    ImageError
-        With the remedy: crop, or give labels.
+    """Refuse an image whose slices across some axis show two large, roundish sections side by side. Raises
+    `ImageError` with the remedy: crop, or give labels.
     """
     tissue, step = _find_tissue(volume)
     for axis in range(3):
@@ -211,18 +262,110 @@ def _find_tissue(volume: Volume) -> tuple[Mask, float]:
     image = sitk.SmoothingRecursiveGaussian(volume.to_sitk(), step / 2)
     coarse = resample_cubic(image, volume, step, sitk.sitkLinear, 0.0)
     tissue = sitk.GetArrayFromImage(sitk.OtsuThreshold(coarse, 0, 1)).astype(bool)
-    padded = binary_closing(np.pad(tissue, 2), np.ones((3, 3, 3)))
+    padded = ndimage.binary_closing(np.pad(tissue, 2), np.ones((3, 3, 3)))
     return padded[2:-2, 2:-2, 2:-2] | tissue, step
 
 
 def _count_sections(plane: Mask, step: float) -> int:
     """Count the large, roundish sections in a slice."""
-    solid = binary_opening(np.pad(binary_fill_holes(plane), 1, mode="edge"), np.ones((3, 3)))
-    parts, count = connected(solid)
+    solid = ndimage.binary_opening(np.pad(ndimage.binary_fill_holes(plane), 1, mode="edge"), np.ones((3, 3)))
+    parts, count = ndimage.label(solid)
     if count == 0:
         return 0
     areas = np.bincount(parts.ravel())[1:]
     large = (areas > _MIN_SECTION_SHARE * areas.max()) & (areas * step**2 > _SMALLEST_MM2)
-    extents = [[part.stop - part.start for part in box] for box in find_objects(parts)]
+    extents = [[part.stop - part.start for part in box] for box in ndimage.find_objects(parts)]
     round_ = np.array([max(sides) <= _MAX_ELONGATION * min(sides) for sides in extents])
     return int((large & round_).sum())
+
+
+def find_bright_fat(levels: Field, limb: Mask, bones: Mask, depth: Field, spacing: Array) -> Mask:
+    """Voxels nearer to fat than to muscle in MRI, as bright as these are in their neighbourhood.
+
+    ``levels`` are relative to muscle, ``depth`` is that below the skin (:func:`compute_depth`). What a coil
+    sees less of is darker, fat and muscle alike, and N4 leaves some of that.
+    """
+    rind = limb & ~bones & (depth < _RIND_MM)
+    sigma = _NOISE_MM / spacing[::-1]
+    weight = ndimage.gaussian_filter(limb.astype(np.float32), sigma, mode="nearest")
+    total = ndimage.gaussian_filter(np.where(limb, levels, 0).astype(np.float32), sigma, mode="nearest")
+    mean = total / np.maximum(weight, 1e-3)  # of the neighbourhood inside the limb
+    return np.asarray(limb & (mean > _compute_half_way_level(levels, rind, spacing)))
+
+
+def _compute_half_way_level(levels: Field, rind: Mask, spacing: Array) -> Field:
+    """Half-way between muscle and fat around each voxel."""
+    every = np.maximum((_SAMPLE_MM / spacing[::-1]).astype(int), 1)
+    thinned = tuple(slice(None, None, n) for n in every)
+    values, inside = levels[thinned], rind[thinned]
+    sampling = spacing[::-1] * every
+    half = np.maximum(np.round(_NEAR_MM / sampling).astype(int), 1)
+    centres = [
+        np.linspace(0, n - 1, max(2, round(n / max(step, 1.0)) + 1))
+        for n, step in zip(values.shape, _NEAR_STEP_MM / sampling)
+    ]
+    found = np.full([len(c) for c in centres], np.nan)
+    for place in np.ndindex(*found.shape):
+        middle = [int(c[n]) for c, n in zip(centres, place)]
+        box = tuple(slice(max(m - h, 0), m + h + 1) for m, h in zip(middle, half))
+        near = values[box][inside[box]]
+        if len(near) >= _MIN_SAMPLES:
+            found[place] = _compute_isodata_level(near)
+    if np.isfinite(found).any():
+        nearest = ndimage.distance_transform_edt(np.isnan(found), return_distances=False, return_indices=True)
+        found = found[tuple(nearest)]
+    else:
+        found[:] = (1 + _USUAL_FAT_LEVEL) / 2
+    k, j, i = (
+        _interpolate_places(np.interp(np.arange(n) / e, c, np.arange(len(c))), len(c))
+        for n, e, c in zip(levels.shape, every, centres)
+    )
+    return np.asarray(j @ np.tensordot(k, found.astype(np.float32), 1) @ i.T, dtype=np.float32)
+
+
+def _compute_isodata_level(values: Field) -> float:
+    """The level half-way between two kinds of tissue (isodata); not a number where there is one kind."""
+    level = float(np.mean(np.percentile(values, (_LOW, _HIGH))))
+    for _ in range(_ROUNDS):
+        above = values > level
+        if above.all() or not above.any():
+            return np.nan
+        low, high = float(values[~above].mean()), float(values[above].mean())
+        level, before = (low + high) / 2, level
+        if level == before:  # more rounds would change nothing
+            break
+    return level if high > _MIN_FAT_LEVEL * low else np.nan
+
+
+def _interpolate_places(places: Array, count: int) -> Field:
+    """The matrix (n, count) that interpolates ``count`` values linearly at fractional indices (n,)."""
+    low = np.minimum(places.astype(int), count - 2)
+    rows, part = np.arange(len(places)), (places - low).astype(np.float32)
+    weights = np.zeros((len(places), count), dtype=np.float32)
+    weights[rows, low], weights[rows, low + 1] = 1 - part, part
+    return weights
+
+
+def select_subcutaneous(bright: Mask, limb: Mask, bones: Mask, depth: Field, spacing: Array) -> Mask:
+    """The part of ``bright`` that belongs to the skin's layer, skin included; all masks ``[k, j, i]``.
+
+    The image's ends (first and last k) do not count as skin.
+    """
+    outer = ~limb | (depth < SKIN_MM)
+    layer = _fill_small_holes(bright | outer, spacing) & ~bones
+    opened = morphology.open_mask(layer, SEPTUM_MM, spacing)
+    joined = ndimage.binary_propagation(outer & opened, mask=opened) | outer
+    # What the layer parts from the inner limb belongs to it too.
+    rest = limb & ~joined
+    joined |= rest & ~find_largest_piece(rest)
+    return np.asarray(joined & limb & ~bones)
+
+
+def _fill_small_holes(mask: Mask, spacing: Array) -> Mask:
+    """Vessels and nerves in the fat filled, slice by slice."""
+    in_slice = np.zeros((3, 3, 3), dtype=int)
+    in_slice[1] = [[0, 1, 0], [1, 1, 1], [0, 1, 0]]
+    parts, _ = ndimage.label(~mask, in_slice)
+    small = np.bincount(parts.ravel()) * float(spacing[0] * spacing[1]) < _VESSEL_MM2
+    small[0] = False
+    return np.asarray(mask | small[parts])

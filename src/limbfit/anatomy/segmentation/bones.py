@@ -1,4 +1,4 @@
-"""Bones in T1- or UTE-like contrast: bright marrow enclosed by dark cortex, both inside the limb.
+"""Bones in T1- or UTE-like contrast, bright marrow enclosed by dark cortex, and in CT.
 
 The *escape level* of a voxel is the brightest that the darkest point of a way out of the limb's slice can
 be. Marrow cannot get out without crossing cortex, so its escape level is dark; subcutaneous fat, fat between
@@ -22,10 +22,17 @@ from scipy.ndimage import label as connected
 
 from ...arrays import Array, Mask
 from ...errors import ImageError
+from .. import morphology
 from ..grid import Grid
-from ..morphology import Field, compute_depth, dilate_mask, erode_mask, fill_slices, find_box, open_mask
+from ..morphology import Field, find_box
 from ..surfaces.extraction import compute_signed_distance_to
 
+MUSCLE_HU = 50.0
+_DENSE_HU = 200.0  # cancellous bone is denser, muscle and contrast-free vessels are not
+_MAX_BONE_HU = 1200.0  # denser than this counts as this, so that metal does not move outlines
+_RIM_MM = 2.5  # in CT the outline is at half of the densest bone this near
+_CLOSE_MM = 2.0  # gaps in thin cortex
+_SMOOTH_MM = 1.0
 _MARROW_LEVEL = 1.15  # marrow is brighter
 _MAX_ESCAPE_LEVEL = 0.78  # and cannot get out without crossing something darker
 _CORTEX_LEVEL = 0.65  # cortex: half-way between muscle (1) and cortical bone (0.2 to 0.3 with partial volume)
@@ -48,7 +55,7 @@ def find_bones(levels: Field, limb: Mask, spacing: Array, smallest_mm3: float) -
     spacing : mm along i, j, k.
     smallest_mm3 : bones smaller than this are left out.
     """
-    deep = compute_depth(limb, spacing) > _SKIN_MM
+    deep = morphology.compute_depth(limb, spacing) > _SKIN_MM
     marrow = deep & (levels > _MARROW_LEVEL) & (compute_escape_level(levels, limb) < _MAX_ESCAPE_LEVEL)
     parts = _number_cavities(marrow, _SEED_PART * smallest_mm3 / float(np.prod(spacing)))
     if parts.max() == 0:
@@ -97,7 +104,7 @@ def _continue_cavity(
     for step, k in ((-1, slices.start), (1, slices.stop - 1)):
         while 0 <= k + step < len(parts):
             box = find_box(parts[k] == value, margin)
-            previous = fill_slices((parts[k][box] == value)[None])[0]
+            previous = morphology.fill_slices((parts[k][box] == value)[None])[0]
             k += step
             here = parts[k][box]
             free = deep[k][box] & ((here == 0) | (here == value))
@@ -109,8 +116,8 @@ def _continue_cavity(
 
 def _find_next_section(previous: Mask, plane: Field, free: Mask, spacing: Array) -> Mask | None:
     """The marrow in the next slice, split from fat around it along the darkest line (watershed)."""
-    inside = erode_mask(previous, _STEP_IN_MM, spacing) & free
-    allowed = dilate_mask(previous, _STEP_OUT_MM, spacing) & free
+    inside = morphology.erode_mask(previous, _STEP_IN_MM, spacing) & free
+    allowed = morphology.dilate_mask(previous, _STEP_OUT_MM, spacing) & free
     if not inside.any():
         return None
     markers = np.where(allowed, 0, 2).astype(np.uint8)
@@ -119,7 +126,7 @@ def _find_next_section(previous: Mask, plane: Field, free: Mask, spacing: Array)
         sitk.GetImageFromArray(-plane), sitk.GetImageFromArray(markers), False, True
     )
     section = (sitk.GetArrayFromImage(basins) == 1) & (plane > _MARROW_LEVEL)
-    section = open_mask(section, _STEP_IN_MM, spacing)
+    section = morphology.open_mask(section, _STEP_IN_MM, spacing)
     ratio = section.sum() / previous.sum()
     return section if _AREA_RATIOS[0] <= ratio <= _AREA_RATIOS[1] else None
 
@@ -141,10 +148,39 @@ def _add_cortex(parts: NDArray[np.int32], levels: Field, deep: Mask, spacing: Ar
     marrow = parts > 0
     distance, nearest = distance_transform_edt(~marrow, sampling=spacing[::-1], return_indices=True)
     dark = deep & (levels < _CORTEX_LEVEL) & (distance < _CORTEX_MM)
-    bone = binary_propagation(marrow, mask=fill_slices(marrow | dark))
-    bone = open_mask(bone, _TAIL_MM, spacing) | marrow
-    bone = binary_propagation(marrow, mask=fill_slices(bone))
+    bone = binary_propagation(marrow, mask=morphology.fill_slices(marrow | dark))
+    bone = morphology.open_mask(bone, _TAIL_MM, spacing) | marrow
+    bone = binary_propagation(marrow, mask=morphology.fill_slices(bone))
     return np.where(bone, parts[tuple(nearest)], 0)
+
+
+def find_dense_bones(hounsfield: Field, limb: Mask, spacing: Array, smallest_mm3: float) -> list[Mask]:
+    """As `find_bones` in CT, by Hounsfield units ``[k, j, i]``; bones that touch are one."""
+    compact = np.minimum(hounsfield, _MAX_BONE_HU)
+    half = (morphology.find_local_maximum(compact, _RIM_MM, spacing) + MUSCLE_HU) / 2
+    dense = limb & (compact > _DENSE_HU)
+    sharp = dense & (compact > half)
+    # Cancellous bone is below half of the cortex beside it, which encloses it.
+    parts, _ = connected(sharp | (dense & _fill_bone(sharp, spacing)))
+    voxel = float(np.prod(spacing))
+    found = []
+    for value, box in enumerate(find_objects(parts), start=1):
+        if (parts[box] == value).sum() * voxel < 0.1 * smallest_mm3:
+            continue
+        bone = np.zeros(limb.shape, dtype=bool)
+        bone[box] = _fill_bone(parts[box] == value, spacing)
+        bone &= limb
+        if bone.sum() * voxel >= smallest_mm3:
+            found.append(bone)
+    return sorted(found, key=lambda bone: -int(bone.sum()))
+
+
+def _fill_bone(part: Mask, spacing: Array) -> Mask:
+    """Close a bone over gaps of its cortex, fill it slice by slice and take its spikes off."""
+    padded = np.pad(part, ((0, 0), (1, 1), (1, 1)))  # a bone goes on beyond its ends, not beside them
+    closed = morphology.fill_slices(morphology.close_mask(padded, _CLOSE_MM, spacing))
+    opened = morphology.open_mask(closed, _SMOOTH_MM, spacing) | padded
+    return np.asarray(opened[:, 1:-1, 1:-1])
 
 
 def name_bones(bones: list[Mask], spacing: Array) -> list[str]:
@@ -214,15 +250,8 @@ def grow_from_seeds(
 ) -> tuple[list[Mask], list[str]]:
     """One bone for each name: the pieces that hold its seeds; a piece with seeds of several names is divided.
 
-    Parameters
-    ----------
-    bones : masks ``[k, j, i]`` on the grid.
-    seeds : (n, 3) points in LPS mm for each name.
-
-    Raises
-    ------
-    ImageError
-        For a seed in no bone.
+    ``bones`` are masks ``[k, j, i]`` on the grid, ``seeds`` (n, 3) points in LPS mm for each name. Raises
+    `ImageError` for a seed in no bone.
     """
     names = list(seeds)
     found = [np.zeros(grid.array.shape, dtype=bool) for _ in names]

@@ -8,13 +8,11 @@ from scipy.ndimage import binary_fill_holes
 
 from ...arrays import Array, Mask
 from ...errors import ImageError
-from ..frame import find_proximal_end
-from ..grid import BONES, DEFAULT_NAMES, FAT, LabelMap, Volume
+from ..grid import BONES, DEFAULT_NAMES, FAT, LabelMap, Volume, find_proximal_end
 from ..morphology import Box, Field, compute_depth, find_box, find_largest_piece
-from .body import estimate_bias_field, estimate_muscle_level, find_limb_axis, find_limb_mask, smooth_image
-from .bones import find_bones, grow_from_seeds, name_bones
-from .ct import Contrast, find_dense_bones, is_ct, rescale_above_air
-from .fat import FAT_HU, find_bright_fat, select_subcutaneous
+from . import body
+from .body import Contrast
+from .bones import find_bones, find_dense_bones, grow_from_seeds, name_bones
 
 Seeds = Mapping[str, ArrayLike]
 
@@ -33,6 +31,9 @@ def segment(
 
     In MRI fat and marrow are bright, muscle is grey, cortical bone dark, air black. Bones, cortex and marrow
     together, are named tibia, fibula, femur and patella where size and place allow, else ``bone-1`` and on.
+    The map is on the image's grid: 0 outside, 1 soft tissue, 2 to 5 the known bones, 6 subcutaneous fat with
+    skin. Raises `ImageError` where no limb or no bone is found, a seed lies in no bone, or the contrast is
+    not the stated one.
 
     Parameters
     ----------
@@ -41,20 +42,10 @@ def segment(
     min_bone_volume_mm3 : smaller bones are left as soft tissue.
     contrast : ``auto`` tells CT from MRI by the grey values.
     seeds : (n, 3) points in LPS mm for the name of each bone; then these bones are labelled and no others.
-
-    Returns
-    -------
-    LabelMap
-        On the image's grid: 0 outside, 1 soft tissue, 2 to 5 the known bones, 6 subcutaneous fat with skin.
-
-    Raises
-    ------
-    ImageError
-        Where no limb or no bone is found, a seed lies in no bone, or the contrast is not the stated one.
     """
-    ct = is_ct(volume, contrast)
-    visible = rescale_above_air(volume) if ct else volume
-    axis = find_limb_axis(visible)
+    ct = body.is_ct(volume, contrast)
+    visible = body.rescale_above_air(volume) if ct else volume
+    axis = body.find_limb_axis(visible)
     del visible
     found = _segment(volume.turn_along(axis), ct, bias_correction, min_bone_volume_mm3, seeds)
     return found.align_axes(volume.direction)
@@ -65,19 +56,19 @@ def _segment(
 ) -> LabelMap:
     """As `segment`, for a volume whose slices lie across the limb."""
     spacing, smallest = volume.spacing, _SEEDED_MM3 if seeds else min_bone_volume_mm3
-    visible = rescale_above_air(volume) if ct else volume
-    smooth = smooth_image(visible)
-    whole = find_limb_mask(visible, smooth)
+    visible = body.rescale_above_air(volume) if ct else volume
+    smooth = body.smooth_image(visible)
+    whole = body.find_limb_mask(visible, smooth)
     del visible
     end, box = find_proximal_end(whole, volume, axis=2), find_box(whole, _MARGIN)
     limb = whole[box]
     if ct:
-        levels = smooth_image(volume)[box]
+        levels = body.smooth_image(volume)[box]
         pieces = find_dense_bones(levels, limb, spacing, smallest)
     else:
         if bias_correction:
-            smooth /= estimate_bias_field(volume, whole)
-        levels = smooth[box] / np.float32(estimate_muscle_level(smooth[box], limb))
+            smooth /= body.estimate_bias_field(volume, whole)
+        levels = smooth[box] / np.float32(body.estimate_muscle_level(smooth[box], limb))
         along = end.order_distal_first
         pieces = [along(piece) for piece in find_bones(along(levels), along(limb), spacing, smallest)]
     del smooth
@@ -107,10 +98,10 @@ def _find_fat(levels: Field, limb: Mask, bone: Mask, ct: bool, spacing: Array) -
     """Subcutaneous fat, by grey levels relative to muscle or, in CT, by Hounsfield units."""
     depth = compute_depth(limb, spacing)
     if ct:
-        bright = (levels > FAT_HU[0]) & (levels < FAT_HU[1])
+        bright = (levels > body.FAT_HU[0]) & (levels < body.FAT_HU[1])
     else:
-        bright = find_bright_fat(levels, limb, bone, depth, spacing)
-    return select_subcutaneous(bright, limb, bone, depth, spacing)
+        bright = body.find_bright_fat(levels, limb, bone, depth, spacing)
+    return body.select_subcutaneous(bright, limb, bone, depth, spacing)
 
 
 def _build_labels(

@@ -29,23 +29,11 @@ _MAX_RELAXATIONS = 20
 
 
 def extract_surface(labels: LabelMap, which: str | None, edge_mm: float = 3.0) -> Surface:
-    """The closed surface of one label, or of the whole limb.
+    """The closed surface of one label, or of the whole limb: LPS mm, outward, of the mask's volume.
 
-    Parameters
-    ----------
-    labels : the label map.
-    which : a label's name; None for the limb with all that is in it.
-    edge_mm : edge length of the triangles.
-
-    Returns
-    -------
-    Surface
-        LPS mm, outward, watertight, of the mask's volume; only the largest body of the mask.
-
-    Raises
-    ------
-    LabelError
-        Where there is nothing to extract.
+    ``which`` is the label's name, None for the limb with all that is in it; ``edge_mm`` the edge length of
+    the triangles. Only the largest body of the mask counts. Raises `LabelError` where there is nothing to
+    extract.
     """
     fine = extract_fine_surface(labels, which, edge_mm)
     return untangle_surface(keep_volume(untangle_surface(remesh(fine, edge_mm)), fine.volume))

@@ -20,18 +20,11 @@ from numpy.typing import ArrayLike
 
 from ...arrays import Array, Indices
 from ...errors import SurfaceError, add_location
-from ..frame import format_place
+from ..grid import format_place
+from . import triangles
 from .extraction import untangle_surface
 from .surfaces import Anatomy, check_anatomy
-from .triangles import (
-    Surface,
-    find_bodies,
-    find_half_edges,
-    find_open_edges,
-    from_pyvista,
-    has_turned_faces,
-    number_components,
-)
+from .triangles import Surface
 
 SMALL_HOLE_MM = 10.0  # a hole that is no wider is filled
 SMALL_HOLE_EDGES, SMALL_HOLE_SHARE = 6, 0.02  # so is one of few edges that is a small share of the surface
@@ -111,17 +104,15 @@ def build_closed_anatomy(
 ) -> tuple[Anatomy, tuple[str, ...]]:
     """The checked anatomy of given surfaces, mended, and what was mended, in words.
 
+    Raises `SurfaceError` for a surface that cannot be mended, or an anatomy that :func:`check_anatomy`
+    refuses.
+
     Parameters
     ----------
     skin, bones : LPS mm.
     cut : point and proximal normal of the proximal cut; by default just inside the caps of skin and bones,
         across the skin's; of a skin that is closed its flat end, or its highest (z).
     files : by the surfaces' names, for the text of errors.
-
-    Raises
-    ------
-    SurfaceError
-        For a surface that cannot be mended, or an anatomy that :func:`check_anatomy` refuses.
     """
     files = files or {}
     mended = {}
@@ -174,12 +165,12 @@ def _choose_closed_cut(
 def find_flat_ends(surface: Surface) -> list[tuple[Array, Array]]:
     """Point and outward unit normal of planes that hold a notable part of a surface, the rest behind."""
     normals, areas, middles = surface.face_normals, surface.face_areas, surface.triangles.mean(axis=1)
-    edges = np.sort(find_half_edges(surface.faces), axis=1)
+    edges = np.sort(triangles.find_half_edges(surface.faces), axis=1)
     order = np.lexsort(edges.T)
     same = (edges[order][1:] == edges[order][:-1]).all(axis=1)
     first, second = order[:-1][same] % len(areas), order[1:][same] % len(areas)
     level = np.einsum("ij,ij->i", normals[first], normals[second]) > np.cos(LEVEL_RAD)
-    patch = number_components(np.column_stack([first[level], second[level]]), len(areas))
+    patch = triangles.number_components(np.column_stack([first[level], second[level]]), len(areas))
     ends = []
     for which in np.flatnonzero(np.bincount(patch, areas) > END_SHARE * surface.area):
         weights = areas * (patch == which)
@@ -204,10 +195,12 @@ def orient_outward(surface: Surface, name: str) -> tuple[Surface, tuple[str, ...
 def orient_faces(surface: Surface) -> Surface:
     """Turn all faces to one side, whichever; return the surface itself if they are, or if none is
     possible."""
-    if not has_turned_faces(surface.faces):
+    if not triangles.has_turned_faces(surface.faces):
         return surface
     faces, patches = igl.bfs_orient(surface.faces)
-    return surface if patches.max() > 0 or has_turned_faces(faces) else Surface(surface.points, faces)
+    return (
+        surface if patches.max() > 0 or triangles.has_turned_faces(faces) else Surface(surface.points, faces)
+    )
 
 
 def count_turned(before: Surface, after: Surface) -> int:
@@ -217,9 +210,9 @@ def count_turned(before: Surface, after: Surface) -> int:
 
 def _remove_loose_pieces(surface: Surface, name: str) -> tuple[Surface, tuple[str, ...]]:
     """Leave out small open pieces beside the largest body; a small closed one may be meant and stays."""
-    main, *others = find_bodies(surface)
+    main, *others = triangles.find_bodies(surface)
     few = MAX_LOOSE_SHARE * len(surface.faces)
-    loose = [part for part in others if len(part.faces) < few and len(find_open_edges(part.faces))]
+    loose = [part for part in others if len(part.faces) < few and len(triangles.find_open_edges(part.faces))]
     if not loose:
         return surface, ()
     kept = [main, *(part for part in others if not any(part is piece for piece in loose))]
@@ -233,7 +226,7 @@ def _remove_loose_pieces(surface: Surface, name: str) -> tuple[Surface, tuple[st
 def open_loops(surface: Surface) -> list[Indices]:
     """Points of each loop in the order of its faces' edges; loops that touch in a point are taken apart."""
     following: dict[int, list[int]] = {}
-    for start, end in find_open_edges(surface.faces).tolist():
+    for start, end in triangles.find_open_edges(surface.faces).tolist():
         following.setdefault(start, []).append(end)
     loops = []
     while following:
@@ -291,7 +284,7 @@ def _cap_open_end(surface: Surface, rim: Array, name: str) -> tuple[Surface, Cap
     point = point + (((rim - point) @ normal).min() - INSIDE_MM) * normal
     cut = surface.to_pyvista().clip(normal=normal, origin=point).extract_surface(algorithm="dataset_surface")
     joined = cut.triangulate().clean(tolerance=JOIN_MM, absolute=True).triangulate()
-    body = find_bodies(from_pyvista(joined))[0]
+    body = triangles.find_bodies(triangles.from_pyvista(joined))[0]
     loops = open_loops(body)
     faces = _triangulate_loop(body.points, loops[0][::-1], normal) if len(loops) == 1 else None
     if faces is None or Surface(body.points, faces).area > MAX_CAP_RATIO * _compute_area(rim):

@@ -18,12 +18,18 @@ from scipy.ndimage import label as connected
 from ...arrays import Array, Indices, Mask
 from ...errors import InputError, LabelError, SurfaceError, add_location
 from ...results.limb import SurfaceMeasures, SurfacesResult
-from ..frame import Frame, ProximalEnd, build_limb_frame, find_proximal_end, select_layer
-from ..grid import LabelMap
+from ..grid import Frame, LabelMap, ProximalEnd, build_limb_frame, find_proximal_end, select_layer
 from ..morphology import find_box
 from .extraction import extract_fine_surface, extract_surface, remesh
-from .surfacefiles import read_surface, write_surface
-from .triangles import Surface, check_closed, find_bodies, find_half_edges, from_pyvista
+from .triangles import (
+    Surface,
+    check_closed,
+    find_bodies,
+    find_half_edges,
+    from_pyvista,
+    read_surface,
+    write_surface,
+)
 
 ON_CUT_MM = 0.1  # nearer to the proximal cut, a point lies on it: flat ends of files are flat to half of that
 END_TOLERANCE_MM = 0.5  # a surface that ends this close to the cut is meant to be cut there
@@ -86,6 +92,9 @@ def build_anatomy(
 ) -> Anatomy:
     """Smooth closed surfaces of a label map.
 
+    Raises `LabelError` for a map without a limb, a limb that the image's side cuts off, or a bone or region
+    that a cut leaves in several pieces; `SurfaceError` for a cut that misses the limb.
+
     Parameters
     ----------
     labels : the limb and its bones; the limb ends at one border of the image or within it.
@@ -93,14 +102,6 @@ def build_anatomy(
     proximal_cut : point and proximal normal (LPS mm) of the cut; by default 2 mm inside the limb's proximal
         end, across the image axis along which it is longest.
     proximal : (3,) LPS, where proximal is, if there is no such cut: of a short stump its shape does not say.
-
-    Raises
-    ------
-    LabelError
-        For a map without a limb, a limb that the image's side cuts off, or a bone or region that a cut
-        leaves in several pieces.
-    SurfaceError
-        For a cut that misses the limb.
     """
     labels = labels.align_with_lps()
     if proximal_cut is None:

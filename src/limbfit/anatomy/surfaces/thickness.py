@@ -38,18 +38,8 @@ def measure_fat_depth(labels: LabelMap, anatomy: Anatomy, edge_mm: float = 3.0) 
 
     Measured along the skin's inward normal to the smooth surface of all that the fat encloses; islands of fat
     between muscles do not count, nor does the skin outside the fat. Zero where muscle or bone lies directly
-    under the skin.
-
-    Parameters
-    ----------
-    labels : the limb with a label ``fat``.
-    anatomy : made from the same labels.
-    edge_mm : edge length of the surface under the fat.
-
-    Raises
-    ------
-    LabelError
-        When the map has no fat, or nothing but fat.
+    under the skin. The anatomy is made from the same labels; ``edge_mm`` is the edge length of the surface
+    under the fat. Raises `LabelError` when the map has no fat, or nothing but fat.
     """
     check_fat(labels)
     core = _build_core(labels)

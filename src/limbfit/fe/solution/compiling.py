@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from ...mesh import Mesh, to_tet10
-from ...mesh.boxes import SIX_TETS, build_boxes
+from ...mesh.cells import SIX_TETS, build_boxes
 from ..contact.rigid import Indenter
 from ..kernel.assembly import is_compiled
 from ..kernel.laws import Laws

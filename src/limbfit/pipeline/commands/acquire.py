@@ -20,7 +20,7 @@ from ...results.limb import TracesResult
 from ...study import Indentation, Record, Study
 from ...traces import COLUMNS
 from ...traces.formats import BINARY_SUFFIXES
-from ...traces.reading import find_factor
+from ...traces.record import find_factor
 from ..engine.store import translate_disk_errors, write_curves, write_json
 
 FOLDER = "acquired"  # beside the study file: measured data, no result
@@ -55,7 +55,7 @@ def acquire_site(
     address : of the device: ``tcp://HOST[:PORT]`` or ``serial:PATH[@BAUD]``.
     operator : where events of the operator come from (`limbfit.acquire.Keyboard`).  None: unattended - the
         limb counts as in place, and the key as held until the search is ``depth_mm`` deep.
-    stops : unattended, where events that end the session come from (`limbfit.acquire.events.Abort`).
+    stops : unattended, where events that end the session come from (`limbfit.acquire.protocol.Abort`).
     depth_mm : where the search ends; by default the record's own, where unattended the site's ``depth_mm`` or
         the depth of its last record, else ``acquire.search_depth_mm``.
     replace_record : also where the study has this record; that one is kept beside the new one.

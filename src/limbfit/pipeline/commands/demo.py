@@ -12,7 +12,7 @@ from ...errors import InputError
 from ...execution import make_executor
 from ...febio import find_febio
 from ...phantom.build import make_phantom, unpack_patient
-from ...phantom.forces import simulate_true_force
+from ...phantom.robot import simulate_true_force
 from ...study import load_study
 from ..engine.context import Listener, Progress, ignore_progress
 from ..engine.store import Store, read_json

@@ -6,13 +6,11 @@ from pathlib import Path
 import numpy as np
 
 from ...anatomy.imaging import LabelMap, Volume, check_image, read_labels, read_volume, write_labels
-from ...anatomy.labels.contours import read_contours, write_contours
-from ...anatomy.labels.labelcheck import clean_labels, place_on_grid
-from ...anatomy.labels.quality import assess_labels
+from ...anatomy.labels.labelcheck import assess_labels, clean_labels, place_on_grid
+from ...anatomy.labels.labelfiles import read_contours, write_contours
 from ...anatomy.segmentation.body import check_one_limb
 from ...anatomy.segmentation.segmentation import segment
-from ...anatomy.sites.marked import extract_marked_skin, remove_markers
-from ...anatomy.sites.registration import register_limb
+from ...anatomy.sites.marked import extract_marked_skin, register_limb, remove_markers
 from ...anatomy.surfaces.surfaces import write_surface
 from ...anatomy.surfaces.thickness import check_fat
 from ...report.drawing.sheet import draw_sheet

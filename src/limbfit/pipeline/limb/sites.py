@@ -5,8 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from ...anatomy.sites.markers import find_markers, match_markers
-from ...anatomy.sites.sites import compute_indenter_axis, project_to_skin
+from ...anatomy.sites.sites import compute_indenter_axis, find_markers, match_markers, project_to_skin
 from ...anatomy.surfaces.surfaces import Anatomy, load_anatomy, read_surface
 from ...errors import SiteError
 from ...results.limb import MarkerEvidence, PlacedSite, SitesResult

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ...anatomy.frame import find_proximal_end
+from ...anatomy.grid import find_proximal_end
 from ...anatomy.imaging import read_labels
 from ...anatomy.labels.labelfiles import normalise_name
 from ...anatomy.segmentation.amputation import amputate_anatomy, amputate_limb

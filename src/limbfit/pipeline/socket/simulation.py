@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...anatomy.meshing.layers import LayerSpec
-from ...anatomy.meshing.liner import build_liner_surface
+from ...anatomy.meshing.layers import LayerSpec, build_liner_surface
 from ...anatomy.meshing.meshing import MeshSettings, mesh_limb
 from ...anatomy.surfaces.surfaces import Anatomy, load_anatomy
 from ...arrays import Array

@@ -22,7 +22,7 @@ from ...fe.observables import compute_element_fields
 from ...indentation import build_materials
 from ...laws import KPA, LAWS, OGDEN
 from ...mesh import Mesh
-from ...mesh.boxes import HEX, build_boxes
+from ...mesh.cells import HEX, build_boxes
 from ...relaxation import DEFAULT_SPAN_S
 from ...results.variants import CubeResult, CubeTissue
 from ...study import Study

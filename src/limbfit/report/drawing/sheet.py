@@ -11,8 +11,8 @@ from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
 from ...anatomy.grid import FAT, SOFT_TISSUE, LabelMap, Volume
-from ...anatomy.labels.contours import find_outlines
-from ...anatomy.labels.quality import LIMB
+from ...anatomy.labels.labelcheck import LIMB
+from ...anatomy.labels.labelfiles import find_outlines
 from ...anatomy.morphology import Box, find_box
 from ...results.limb import QualityResult
 
