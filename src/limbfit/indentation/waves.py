@@ -25,8 +25,7 @@ import numpy as np
 from ..arrays import Array, Indices, Mask
 from ..errors import ProblemError
 from ..fe import Material, Result
-from ..fe.kernel.evaluation_points import EvaluationPoints, evaluate_elastic_at
-from ..fe.kernel.laws import Laws
+from ..fe.kernel.laws import EvaluationPoints, Laws, evaluate_elastic_at
 from ..fe.memory import Memory
 from ..mesh import Mesh, locate
 from ..study import Vector

@@ -10,7 +10,7 @@ from ..anatomy.surfaces.surfaces import Anatomy, Surface
 from ..arrays import Array
 from ..socket import Area, Recipe, Socket, read_socket, rectify_limb
 from ..socket.landmarks import Directions, build_default_regions, find_directions, find_knee_centre
-from ..socket.trim import Trim
+from ..socket.rectify import Trim
 from .geometry import Limb
 from .surfaces import build_outer_surface
 
