@@ -7,7 +7,9 @@ every entry of every element's upper triangle knows its place in it.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
+from functools import cache
 from itertools import pairwise
 from typing import Protocol, TypeVar
 
@@ -28,9 +30,14 @@ from .motion import Drives
 from .pattern import Pattern, append_rows, build_node_graph, build_upper_pattern, find_positions
 from .pressure import Pressures
 from .problem import Problem, ProblemError
-from .threads import get_thread_pool
 
 T = TypeVar("T")
+
+
+@cache
+def get_thread_pool(threads: int) -> ThreadPoolExecutor:
+    """Workers for compiled kernels that let go of the interpreter; kept for the life of the process."""
+    return ThreadPoolExecutor(threads)
 
 
 @dataclass(frozen=True)

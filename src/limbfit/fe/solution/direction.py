@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from ...arrays import Array
 from ..contact.contact import Touch
 from ..system import Evaluation, System
-from .factor import Factor, LinearSolution
-from .springs import SpringChange
+from .factor import Factor, LinearSolution, SpringChange
 
 Bools = NDArray[np.bool_]
 SWEEPS, ROUNDS = 12, 4

@@ -254,7 +254,7 @@ def _collect_statistics(run: SteppedRun, seconds: float, sunk_steps: int) -> dic
         "factorisations": sum(factor.counts["factorisations"] for factor in used),
         "solves": sum(factor.counts["half_solves"] for factor in used) // 2,
         "double_precision": any(factor.counts["double_precision"] for factor in used),
-        "linear_solver": run.factor.name,
+        "linear_solver": run.factor.solver.name,
         "element": run.system.element.name,
         "unknowns": run.system.unknowns,
         "seconds": {**parts, "total": seconds},
