@@ -15,9 +15,8 @@ from ..anatomy.frame import Frame, format_place
 from ..anatomy.surfaces.triangles import Surface
 from ..arrays import Array, Indices
 from ..errors import SurfaceError
-from .clearance import apply_clearance
 from .pressing import Area
-from .rays import FOLD_MM, LimbProfile, Offsets, compute_profile
+from .rays import FOLD_MM, LimbProfile, Offsets, apply_clearance, compute_profile
 from .shape import Socket
 
 MIN_FACE_MM = 30.0  # of face between the distal end and the brim, along the limb

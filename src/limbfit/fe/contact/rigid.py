@@ -19,22 +19,18 @@ from ...shapes import SHAPES, SHARP_EDGE, RigidSurface, Shape, Size
 
 
 class RigidShape(ABC):
-    """A rigid shape with a frame of its own, in which it is asked for distances; mm."""
+    """A rigid shape with a frame of its own, in which it is asked for distances; mm.
 
-    @property
-    @abstractmethod
-    def centre(self) -> Sequence[float] | Array:
-        """(3,) the origin of the frame."""
+    Parameters
+    ----------
+    centre : (3,) the origin of the frame.
+    axis : (3,) its last axis, of any length; it points into the tissue.
+    edge : (3,) a direction in the plane of its first and last axis.
+    """
 
-    @property
-    @abstractmethod
-    def axis(self) -> Sequence[float] | Array:
-        """(3,) the last axis of the frame, of any length; it points into the tissue."""
-
-    @property
-    @abstractmethod
-    def edge(self) -> Sequence[float] | Array | None:
-        """(3,) a direction in the plane of the frame's first and last axis."""
+    centre: Sequence[float] | Array
+    axis: Sequence[float] | Array
+    edge: Sequence[float] | Array | None
 
     @property
     @abstractmethod

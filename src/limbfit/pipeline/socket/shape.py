@@ -13,7 +13,6 @@ from ...arrays import Array
 from ...errors import StudyError, SurfaceError
 from ...laws import FIBRED
 from ...socket import Area, Recipe, Socket, read_socket, rectify_limb
-from ...socket.clearance import refuse_bones
 from ...socket.landmarks import (
     STANDARD_LOADS,
     SkinRegion,
@@ -25,6 +24,7 @@ from ...socket.landmarks import (
 )
 from ...socket.pressing import Target
 from ...socket.rectify import Trim
+from ...socket.shape import refuse_bones
 from ...socket.wall import build_wall
 from ...study import Study
 from ...study.socket import SocketLoadTable
