@@ -6,8 +6,8 @@ the same mesh with other materials is quicker with ``warm_start=result`` of a ru
 """
 
 from ..shapes import RigidSurface as RigidSurface
-from .contact.open_surface import OpenSurface as OpenSurface
 from .contact.rigid import Indenter as Indenter
+from .contact.rigid import OpenSurface as OpenSurface
 from .contact.smooth_surface import SmoothSurface as SmoothSurface
 from .diagnostics import SimulationWarning as SimulationWarning
 from .diagnostics import list_texts as list_texts

@@ -37,7 +37,7 @@ from ...shapes.triangles import (
     feature_normal,
     find_neighbours,
 )
-from .open_surface import Wall, check_open_surface
+from .rigid import Wall, check_open_surface, compute_features
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,11 +188,7 @@ def fit_spline_coefficients(
     Not a number where a spline would need samples farther away than the reach.
     """
     whole, all_faces = _extend_past_brim(points, faces, PAST * grid.spacing)
-    corners = np.ascontiguousarray(whole[all_faces])
-    normals = compute_triangle_normals(corners)[0]
-    sums = compute_normal_spread(whole, all_faces, normals)[1]
-    beyond = find_neighbours(all_faces)
-    edges = normals[:, None] + np.where(beyond[..., None] >= 0, normals[beyond], 0.0)
+    corners, normals, edges, sums = compute_features(whole, all_faces)
     own, past = np.arange(len(faces)), np.arange(len(faces), len(all_faces))
     trees: tuple[Tree, Tree, Tree] = (
         build_tree(corners, np.arange(len(corners))),
@@ -200,7 +196,7 @@ def fit_spline_coefficients(
         build_tree(corners, past if len(past) else own),
     )
     out = np.full((2, *grid.shape), np.nan)
-    facets = corners, normals, edges, sums[all_faces], trees
+    facets = corners, normals, edges, sums, trees
     _sample(facets, len(faces), len(past) > 0, grid.low, grid.spacing, reach + MARGIN * grid.spacing, out)
     for axis in (1, 2, 3):
         inner = np.moveaxis(out, axis, 0)
