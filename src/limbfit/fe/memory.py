@@ -8,12 +8,14 @@ import numpy as np
 from numba import njit
 
 from ..arrays import Array
-from .kernel.laws import Laws
+from .kernel.laws import EvaluationPoints, Laws
 from .kernel.response import add_material_fibre_stress, elastic_response, pull_back
 from .lanes import LANES, workspace
 from .materials import compute_prony_factors
 from .motion import Drives
-from .system import Increment, Points, System
+from .system import Increment, System
+
+Points = System | EvaluationPoints  # those with a past of their own
 
 
 @dataclass(frozen=True)

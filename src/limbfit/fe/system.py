@@ -11,10 +11,9 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import cache
 from itertools import pairwise
-from typing import Protocol, TypeVar
+from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..arrays import Array
 from .bodies import Bodies, Contacts, count_body_rows
@@ -102,18 +101,6 @@ class Evaluation:
         if self.data is None:
             raise ValueError("the tangent was not evaluated")
         return self.data
-
-
-class Points(Protocol):
-    """Points with a history of their own: the quadrature points of a `System`, or places elsewhere."""
-
-    @property
-    def weights(self) -> Array:
-        """(m, q) of q points in each of m elements, mm^3."""
-
-    @property
-    def regions(self) -> NDArray[np.int32]:
-        """(m,) of the elements."""
 
 
 class System:

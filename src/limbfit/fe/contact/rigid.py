@@ -19,7 +19,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from ...arrays import Array
+from ...arrays import Array, Indices, Mask
 from ...errors import ProblemError
 from ...shapes import SHAPES, SHARP_EDGE, RigidSurface, Shape, Size
 from ...shapes.triangles import (
@@ -37,7 +37,7 @@ from ...shapes.triangles import (
 
 # What lies beyond the brim by less than this share of the triangle beside it is still met.
 BEYOND = 0.02
-Facets = tuple[Array, Array, Array, Array, NDArray[np.bool_], Tree]
+Facets = tuple[Array, Array, Array, Array, Mask, Tree]
 
 
 class RigidShape(ABC):
@@ -86,7 +86,7 @@ class RigidShape(ABC):
         return self.placed(np.asarray(self.centre, dtype=float) + move, *self.frame[[2, 0]])
 
     @abstractmethod
-    def near(self, points: Array) -> NDArray[np.bool_]:
+    def near(self, points: Array) -> Mask:
         """Which points (n, 3) of its frame it may touch; the distance of others is not computed."""
 
     @abstractmethod
@@ -182,7 +182,7 @@ class Indenter(RigidShape):
     def placed(self, centre: Array, axis: Array, edge: Array) -> Self:
         return replace(self, centre=centre, axis=axis, edge=edge)
 
-    def near(self, points: Array) -> NDArray[np.bool_]:
+    def near(self, points: Array) -> Mask:
         x, y, z = points.T
         reach = self.body.reach
         return np.asarray((z <= self.width / 2) & (np.abs(x) <= reach) & (np.abs(y) <= reach))
@@ -204,7 +204,7 @@ class Wall(RigidShape):
     """
 
     points: Array
-    faces: NDArray[np.int64]
+    faces: Indices
     centre: Sequence[float] | Array = (0.0, 0.0, 0.0)
     axis: Sequence[float] | Array = (0.0, 0.0, 1.0)
     edge: Sequence[float] | Array = (1.0, 0.0, 0.0)
@@ -231,7 +231,7 @@ class Wall(RigidShape):
         return other
 
 
-def check_open_surface(points: Array, faces: NDArray, name: str) -> tuple[Array, NDArray[np.int64]]:
+def check_open_surface(points: Array, faces: NDArray, name: str) -> tuple[Array, Indices]:
     """The arrays of a surface with one side. Raises `ProblemError` where it is no triangle surface, or its
     triangles do not agree on a side.
     """
@@ -284,7 +284,7 @@ class OpenSurface(Wall):
         brim = np.concatenate([open_edges, np.isin(self.faces, ends)], axis=1)  # (m, 6): edges and corners
         return corners, normals, edges, sums, brim, build_tree(corners, np.arange(len(corners)))
 
-    def near(self, points: Array) -> NDArray[np.bool_]:
+    def near(self, points: Array) -> Mask:
         low, high = self._box
         return np.asarray(((points >= low) & (points <= high)).all(axis=1))
 
@@ -292,7 +292,7 @@ class OpenSurface(Wall):
         return compute_wall_distances(x, self._facets, self.reach)
 
 
-def compute_features(points: Array, faces: NDArray[np.int64]) -> tuple[Array, Array, Array, Array]:
+def compute_features(points: Array, faces: Indices) -> tuple[Array, Array, Array, Array]:
     """Corners (m, 3, 3) of triangles, normals (m, 3), and directions (m, 3, 3) of edges and of corners."""
     corners = np.ascontiguousarray(points[faces])
     normals = compute_triangle_normals(corners)[0]

@@ -26,7 +26,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from ...arrays import Array
+from ...arrays import Array, Indices, Mask
 from ...errors import ProblemError
 from ...shapes.triangles import (
     Tree,
@@ -115,7 +115,7 @@ class SmoothSurface(Wall):
         other.__dict__["growth"] = share
         return other
 
-    def near(self, points: Array) -> NDArray[np.bool_]:
+    def near(self, points: Array) -> Mask:
         place = (points - self.grid.low) / self.grid.spacing
         return np.asarray(((place >= 1.0) & (place < np.array(self.grid.shape) - 2.0)).all(axis=1))
 
@@ -179,9 +179,7 @@ class DistanceGrid:
         return cls(low, spacing, (x, y, z))
 
 
-def fit_spline_coefficients(
-    grid: DistanceGrid, points: Array, faces: NDArray[np.int64], reach: float
-) -> Array:
+def fit_spline_coefficients(grid: DistanceGrid, points: Array, faces: Indices, reach: float) -> Array:
     """(2, x, y, z) of the distance from the wall, positive on the side from which its triangles run
     counter-clockwise, and of the way beyond its brim, mm.
 
@@ -206,7 +204,7 @@ def fit_spline_coefficients(
     return out
 
 
-def _extend_past_brim(points: Array, faces: NDArray[np.int64], by: float) -> tuple[Array, NDArray[np.int64]]:
+def _extend_past_brim(points: Array, faces: Indices, by: float) -> tuple[Array, Indices]:
     """The surface with a strip of ``by`` mm past its brim; the strip's faces are the last ones."""
     ahead = np.roll(faces, -1, axis=1)
     brim = find_neighbours(faces) < 0

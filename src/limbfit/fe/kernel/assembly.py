@@ -10,9 +10,8 @@ from pathlib import Path
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
-from ...arrays import Array
+from ...arrays import Array, Index
 from ..lanes import COMPILED, LANES, block_places, prefetch, workspace
 from .laws import Tables
 from .response import (
@@ -24,8 +23,7 @@ from .response import (
     weighted_moduli,
 )
 
-Indices = NDArray[np.int32]
-Elements = tuple[Indices, Array, Array, Indices, Array, Array]
+Elements = tuple[Index, Array, Array, Index, Array, Array]
 
 
 def assemble(
@@ -36,7 +34,7 @@ def assemble(
     history: Array,
     u: Array,
     tangent: bool,
-    positions: Indices,
+    positions: Index,
     residual: Array,
     data: Array,
 ) -> float:

@@ -8,9 +8,8 @@ from typing import Any
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
-from ...arrays import Array
+from ...arrays import Array, Index, Indices
 from ...mesh import Mesh
 from ..lanes import LANES, workspace
 from ..materials import Material
@@ -23,7 +22,7 @@ from .response import (
     pull_back,
 )
 
-Tables = tuple[Array, Array, NDArray[np.int64], NDArray[np.int64], Array]
+Tables = tuple[Array, Array, Indices, Indices, Array]
 
 
 @dataclass(frozen=True)
@@ -37,13 +36,13 @@ class Laws:
 
     numbers: Array
     kappa: Array
-    law: NDArray[np.int64]
-    elastic: NDArray[np.int64]
+    law: Indices
+    elastic: Indices
     prony: Array
     d_numbers: Array
     d_kappa: Array
     d_prony: Array
-    parameter_index: NDArray[np.int64]
+    parameter_index: Indices
     moduli: Array
     modulus_gradient: Array
     fibre: Array
@@ -108,27 +107,24 @@ class Laws:
         )  # fmt: skip
 
 
-Ints = NDArray[np.int64]
-
-
 @dataclass(frozen=True)
 class EvaluationPoints:
-    """Points (m,) in a mesh, each as an element with one point (`Points` of `fe.system`).
+    """Points (m,) in a mesh, each as an element with one point.
 
     ``cells (m, k)`` are nodes of its element, ``gradients (m, 1, 3, k)`` of their shape functions at the
     point, 1/mm; ``regions (m,)``, ``fibres`` and ``prestretch`` as a `System` has them.
     """
 
-    cells: NDArray[np.int32]
+    cells: Index
     gradients: Array
     weights: Array
-    regions: NDArray[np.int32]
+    regions: Index
     fibres: Array
     prestretch: Array
 
     @classmethod
     def at(
-        cls, mesh: Mesh, element: Element, cells: Ints, local: Array, fibres: Array, prestretch: Array
+        cls, mesh: Mesh, element: Element, cells: Indices, local: Array, fibres: Array, prestretch: Array
     ) -> EvaluationPoints:
         """Points with ``local`` coordinates (m, 3) in ``cells`` (m,) of a mesh.
 

@@ -22,13 +22,12 @@ import numpy as np
 import scipy.sparse.linalg as spla
 from numpy.typing import NDArray
 
-from ...arrays import Array
+from ...arrays import Array, Index, Indices, Mask
 from ..bodies import GROUNDING_STIFFNESS
 from ..problem import Problem
 from ..system import System
 from .linear import (
     NONE,
-    Index,
     LinearSolver,
     NotPositiveDefiniteError,
     build_linear_solver,
@@ -38,7 +37,6 @@ from .linear import (
 from .multigrid import Multigrid
 
 Single = NDArray[np.float32]
-Bools = NDArray[np.bool_]
 # Smaller changes, relative to the stiffest spring, are left to the iteration.
 NOTABLE_CHANGE = 0.03
 # With more columns than this the dense solutions cost too much.
@@ -223,9 +221,7 @@ class Factor:
         self.seconds["product"] += time.perf_counter() - started
         return y
 
-    def change_springs(
-        self, touched: NDArray[np.bool_], normals: Array, blocks: Array
-    ) -> SpringChange | None:
+    def change_springs(self, touched: Mask, normals: Array, blocks: Array) -> SpringChange | None:
         """What springs that differ from the factor's do to its solutions; None: they are too many.
 
         ``touched (c,)``: springs that will be pushed although they may not differ.
@@ -342,7 +338,7 @@ def compute_shear_stiffness(system: System, moduli: Array) -> Array:
     return data
 
 
-def compute_body_stiffness(system: System, moduli: Array) -> tuple[NDArray[np.int32], Array]:
+def compute_body_stiffness(system: System, moduli: Array) -> tuple[Index, Array]:
     """Diagonal entries of the coordinates that are free to move rigid bodies, and what holds those of bodies
     that touch nothing (k,), N/mm."""
     if not system.bodies.free:
@@ -393,7 +389,7 @@ class SpringColumns:
         count = 0 if blocks is None else len(blocks)
         self.at_points = np.empty((count, 3, 0))
 
-    def change(self, touched: Bools, normals: Array, blocks: Array, most: int) -> SpringChange | None:
+    def change(self, touched: Mask, normals: Array, blocks: Array, most: int) -> SpringChange | None:
         """The change to ``blocks``; None where it needs more than ``most`` columns.
 
         ``touched (c,)``: springs to be pushed along ``normals (c, 3)`` although they may not differ.
@@ -410,7 +406,7 @@ class SpringColumns:
         return SpringChange(self, np.array(list(self.keys), dtype=int).reshape(-1, 2), frames, change,
                             0.1 * NOTABLE_CHANGE * typical)  # fmt: skip
 
-    def displace_points(self, y: Array, closed: Bools) -> Array:
+    def displace_points(self, y: Array, closed: Mask) -> Array:
         """Displacements (c, 3) of the contact points by the half solution ``y (n, 1)``.
 
         Where only inner points are ``closed (c,)``, the others are taken to stay.
@@ -426,7 +422,7 @@ class SpringColumns:
         y[self.rows] += self.W[:, : len(coefficients)] @ coefficients.astype(np.float32)
         return y
 
-    def _complete(self, wanted: Bools, most: int) -> bool:
+    def _complete(self, wanted: Mask, most: int) -> bool:
         """Make the columns that are missing, unless they would be too many in all."""
         new = [key for key in zip(*map(np.ndarray.tolist, np.nonzero(wanted))) if key not in self.keys]
         costly = sum(not self.inner[point] for point, _ in (*self.keys, *new))
@@ -473,7 +469,7 @@ class SpringChange:
     """
 
     def __init__(
-        self, columns: SpringColumns, keys: NDArray[np.int64], frames: Array, change: Array, little: float
+        self, columns: SpringColumns, keys: Indices, frames: Array, change: Array, little: float
     ) -> None:
         self._columns, (self._points, axes) = columns, keys.T
         self._directions = frames[self._points, axes]

@@ -22,12 +22,9 @@ from numba import njit
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_info
 
-from ...arrays import Array
+from ...arrays import Array, Index, Indices
 from ...errors import ProblemError
 from ..system import get_thread_pool
-
-Index = NDArray[np.int32]
-
 
 # An environment variable: with any value, PARDISO counts as not installed.
 WITHOUT_PARDISO = "LIMBFIT_WITHOUT_PARDISO"
@@ -216,7 +213,7 @@ def _call_pardiso(
     return error.value
 
 
-def _release(mkl: Any, handle: NDArray[np.int64], parameters: Index, n: ctypes.c_int32) -> None:
+def _release(mkl: Any, handle: Indices, parameters: Index, n: ctypes.c_int32) -> None:
     empty, none = np.zeros(1), np.zeros(1, dtype=np.int32)
     _call_pardiso(mkl, handle, parameters, n, -1, 1, empty, none, none, none, empty, empty)
 
