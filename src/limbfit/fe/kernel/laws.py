@@ -14,13 +14,7 @@ from ...mesh import Mesh
 from ..lanes import LANES, workspace
 from ..materials import Material
 from .elements import Element
-from .response import (
-    add_material_fibre_moduli,
-    add_material_fibre_stress,
-    elastic_moduli,
-    elastic_response,
-    pull_back,
-)
+from .response import elastic_moduli, elastic_response, pull_back
 
 Tables = tuple[Array, Array, Indices, Indices, Array]
 
@@ -174,11 +168,8 @@ def _evaluate_elastic_at(elements, tables, u, records, stress, D, F):  # type: i
     m = len(stress)
     for start in range(0, m, LANES):
         elastic_response(elements, start, tables, u, points, law[0], numbers)
-        pull_back(p)
-        elastic_moduli(p, element[0])
-        if len(elements[4]):
-            add_material_fibre_stress(p)
-            add_material_fibre_moduli(p, element[0])
+        pull_back(p, len(elements[4]) > 0)
+        elastic_moduli(p, element[0], len(elements[4]) > 0)
         for l in range(min(LANES, m - start)):
             for r in range(6):
                 stress[start + l, r] = p.tau[r, l]
