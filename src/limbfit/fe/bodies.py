@@ -11,16 +11,9 @@ import numpy as np
 import scipy.sparse as sp
 
 from ..arrays import Array, Index, Mask
-from .contact.contact import (
-    ContactSurface,
-    RigidShape,
-    Touch,
-    add_springs,
-    check_clear,
-    contact,
-    find_touching_offset,
-)
+from .contact.contact import ContactSurface, Touch, add_springs, check_clear, contact, find_touching_offset
 from .contact.friction import StickyContact
+from .contact.rigid import RigidShape
 from .contact.tool import Distances, Pose, Tool
 from .kernel.elements import Element
 from .motion import Drives, Motion, RigidBody

@@ -14,12 +14,7 @@ from numba import njit
 from ...arrays import Array, Index
 from ..lanes import COMPILED, LANES, block_places, prefetch, workspace
 from .laws import Tables
-from .response import (
-    elastic_response,
-    kirchhoff_stress,
-    pressures,
-    weighted_moduli,
-)
+from .response import elastic_response, kirchhoff_stress, pressures, weighted_moduli
 
 Elements = tuple[Index, Array, Array, Index, Array, Array]
 
