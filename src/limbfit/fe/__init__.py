@@ -9,8 +9,6 @@ from ..shapes import RigidSurface as RigidSurface
 from .contact.rigid import Indenter as Indenter
 from .contact.rigid import OpenSurface as OpenSurface
 from .contact.smooth_surface import SmoothSurface as SmoothSurface
-from .diagnostics import SimulationWarning as SimulationWarning
-from .diagnostics import list_texts as list_texts
 from .kernel.elements import ELEMENTS as ELEMENTS
 from .materials import ORDER_IN_TIME as ORDER_IN_TIME
 from .materials import VOLUMETRIC_LAWS as VOLUMETRIC_LAWS
@@ -32,8 +30,10 @@ from .problem import Problem as Problem
 from .problem import Support as Support
 from .problem import isochoric_stretch as isochoric_stretch
 from .result import Result as Result
+from .result import SimulationWarning as SimulationWarning
 from .result import State as State
 from .result import Step as Step
+from .result import list_texts as list_texts
 from .solution.compiling import are_compiled as are_compiled
 from .solution.compiling import compile_kernels as compile_kernels
 from .solution.control import StepControl as StepControl

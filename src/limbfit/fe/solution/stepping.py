@@ -17,17 +17,19 @@ from numpy.typing import NDArray
 
 from ...arrays import Array
 from ...errors import ProblemError
-from ..diagnostics import (
+from ..observables import compute_element_fields
+from ..problem import Problem
+from ..result import (
+    Result,
     SimulationWarning,
+    State,
+    Step,
     find_inexact_sensitivities,
     find_inexact_steps,
     find_inverted_elements,
     find_penetration,
     find_slip,
 )
-from ..observables import compute_element_fields
-from ..problem import Problem
-from ..result import Result, State, Step
 from ..system import System
 from .control import StepControl
 from .simulation import SteppedRun
