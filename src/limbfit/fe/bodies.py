@@ -234,7 +234,7 @@ class Bodies:
         """Stiffness (k,) of the free coordinates of bodies that touch nothing, N/mm, in tissue of a shear
         ``modulus``."""
         sizes = [np.full(len(body.free), body.start.width) for body in self.all]
-        return GROUNDING_STIFFNESS * modulus * np.concatenate(sizes)
+        return GROUNDING_STIFFNESS * modulus * np.concatenate([np.zeros(0), *sizes])
 
     def _holding_stiffness(self, body: _Body, penalty: float) -> float:
         """What holds a free coordinate where a displacement drives it, N/mm."""

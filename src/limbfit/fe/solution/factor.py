@@ -341,11 +341,8 @@ def compute_shear_stiffness(system: System, moduli: Array) -> Array:
 def compute_body_stiffness(system: System, moduli: Array) -> tuple[Index, Array]:
     """Diagonal entries of the coordinates that are free to move rigid bodies, and what holds those of bodies
     that touch nothing (k,), N/mm."""
-    if not system.bodies.free:
-        return np.zeros(0, dtype=np.int32), np.zeros(0)
-    return system.indptr[-1 - system.bodies.free : -1], system.bodies.compute_grounding(
-        float(np.mean(moduli))
-    )
+    places = system.indptr[-1 - system.bodies.free : -1]
+    return places, system.bodies.compute_grounding(float(np.mean(moduli)))
 
 
 def find_touched_unknowns(system: System, problem: Problem) -> Index:
