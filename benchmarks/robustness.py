@@ -31,7 +31,7 @@ from mapped_bodies import Array, Indices, slab
 from robustness_cases import ELEMENT, USUAL, Asked, draw, problem_of
 
 from limbfit.fe import History, Indenter, OgdenQLV, Problem, Result, solve
-from limbfit.fe.diagnostics import find_slip
+from limbfit.fe.result import find_slip
 from limbfit.mesh import node_jacobians
 
 

@@ -30,7 +30,7 @@ HEIGHT = {room: -level for level, rooms in enumerate(FLOORS) for room in rooms}
 # Floors inside a room, from the top; "" is what stands in the room's own folder.
 INNER_FLOORS = {
     "anatomy": ["imaging", "meshing", "sites", "segmentation", "surfaces", "labels", "images", ""],
-    "fe": ["__init__", "solution", "", "contact", "kernel", "materials", "lanes threads"],
+    "fe": ["__init__", "solution", "", "contact", "kernel", "materials", "lanes"],
     "identify": ["__init__", "checks", "uncertainty", "fit"],
     "pipeline": [
         "__init__",

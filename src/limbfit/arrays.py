@@ -5,4 +5,5 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
+Index = NDArray[np.int32]  # short: what the compiled kernels take
 Mask = NDArray[np.bool_]

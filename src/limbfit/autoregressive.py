@@ -6,14 +6,13 @@ independent: a factor of 39 where the correlation of neighbours is 0.95.
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
-from .arrays import Array
+from .arrays import Array, Indices
 
 MAX_LAG = 0.999  # correlation of neighbours beyond which no covariance can be made of it
 
 
-def compute_block_covariance(sd: float, lag: float, samples: NDArray[np.int64]) -> Array:
+def compute_block_covariance(sd: float, lag: float, samples: Indices) -> Array:
     """Covariance (n, n) of means of ``samples`` (n,) neighbours of a noise of deviation ``sd``."""
     lags = np.arange(samples.max())
     powers = lag**lags

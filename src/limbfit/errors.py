@@ -18,6 +18,7 @@ A *failed simulation* is not an exception: it is a result with ``completed=False
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 
 
@@ -53,13 +54,7 @@ class InputError(LimbfitError):
 
     def __reduce__(self) -> tuple:
         """Survive the trip back from a worker process (the default would lose the keywords)."""
-        state = {"what": self.what, "file": self.file, "place": self.place, "remedy": self.remedy}
-        return (_rebuild, (type(self), state))
-
-
-def _rebuild(kind: type[InputError], state: dict) -> InputError:
-    what = state.pop("what")
-    return kind(what, **state)
+        return partial(type(self), file=self.file, place=self.place, remedy=self.remedy), (self.what,)
 
 
 @contextmanager

@@ -9,9 +9,9 @@ from blocks import punch
 from limbfit import OgdenQLV
 from limbfit.bench.timing import build_punched_block
 from limbfit.fe import History, Problem, Result, StepControl, solve
-from limbfit.fe.diagnostics import find_inverted_elements
 from limbfit.fe.kernel.laws import Laws
 from limbfit.fe.observables import compute_contact_pressure
+from limbfit.fe.result import find_inverted_elements
 from limbfit.fe.system import Increment
 from limbfit.mesh import node_jacobians
 

@@ -11,7 +11,7 @@ from limbfit.bench.timing import build_punched_block
 from limbfit.fe import Problem, StepControl, Support, System, solve
 from limbfit.fe.kernel.laws import Laws
 from limbfit.fe.memory import Memory
-from limbfit.fe.solution.factor import Factor
+from limbfit.fe.solution.factor import Factor, find_touched_unknowns
 from limbfit.fe.solution.linear import (
     SOLVERS,
     WITHOUT_PARDISO,
@@ -21,7 +21,6 @@ from limbfit.fe.solution.linear import (
 )
 from limbfit.fe.solution.multigrid import Multigrid
 from limbfit.fe.solution.simulation import SteppedRun
-from limbfit.fe.solution.springs import find_touched_unknowns
 
 
 def system(n: int = 200) -> tuple[sp.csr_matrix, np.ndarray]:
@@ -92,7 +91,7 @@ def test_springs_under_the_indenter_and_beside_it_are_taken_in_exactly():
     bodies, stiff = system.bodies, 50.0 * laws.modulus
     last = find_touched_unknowns(system, problem)
     factor = Factor(system, laws.moduli, last=last)
-    if not factor.transposed:
+    if not factor.solver.transposed:
         pytest.skip("the factor of this machine knows no halves")
     inner = factor.columns.inner
     assert 0 < len(last) < system.unknowns / 5
@@ -118,7 +117,7 @@ def test_springs_on_held_nodes_are_no_columns_of_unknowns_that_go_last():
     system = System(replace(problem, fixed=held))
     laws = Laws.build([problem.materials[name] for name in problem.mesh.region_names])
     factor = Factor(system, laws.moduli)
-    assert not len(factor.last)
+    assert not len(factor.solver.last)
     assert not factor.columns.inner.any()
     assert len(factor.columns.W) == system.unknowns
 

@@ -13,7 +13,7 @@ from blocks import FINE_Z, SKIN, block, punch
 
 from limbfit.errors import ProblemError
 from limbfit.fe import History, OgdenQLV, Problem, Result, StepControl, Support, solve
-from limbfit.fe.diagnostics import find_slip
+from limbfit.fe.result import find_slip
 from limbfit.fe.solution.control import StepController
 from limbfit.mesh import Mesh
 from limbfit.study import MaterialTable

@@ -21,7 +21,7 @@ from limbfit.errors import ProblemError
 from limbfit.fe import Checkpoints, OgdenQLV, StepControl, solve
 from limbfit.pipeline.engine.store import ResultFiles
 from limbfit.socket import Recipe, rectify_limb
-from limbfit.socket.trim import Trim
+from limbfit.socket.rectify import Trim
 
 UP = np.array([0.0, 0.0, 1.0])
 TISSUES = {"skin": OgdenQLV(0.009, 6.0, 2.0, 0.5), "muscle": OgdenQLV(0.004, 4.0, 3.0, 0.3)}

@@ -7,8 +7,7 @@ import pytest
 from socket_limbs import round_limb
 
 from limbfit.errors import SurfaceError
-from limbfit.socket.landmarks import find_directions, find_knee_centre
-from limbfit.socket.loads import STANDARD_LOADS
+from limbfit.socket.landmarks import STANDARD_LOADS, find_directions, find_knee_centre
 from limbfit.study.socket import Preset
 
 

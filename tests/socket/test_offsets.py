@@ -12,8 +12,7 @@ from limbfit.anatomy.surfaces.triangles import Surface
 from limbfit.errors import SurfaceError
 from limbfit.socket import Recipe, Zone, rectify_limb
 from limbfit.socket.rays import LimbProfile, Offsets, compute_offsets, compute_profile
-from limbfit.socket.rectify import reduce_to_volume
-from limbfit.socket.trim import Trim
+from limbfit.socket.rectify import Trim, reduce_to_volume
 
 LIMB = round_limb()
 FRAME = build_limb_frame(LIMB.cut_point, LIMB.cut_normal)

@@ -14,7 +14,7 @@ from limbfit.anatomy.surfaces.triangles import Surface
 from limbfit.errors import SurfaceError
 from limbfit.socket import Area, Recipe, Socket, rectify_limb
 from limbfit.socket.landmarks import find_knee_centre
-from limbfit.socket.trim import Trim
+from limbfit.socket.rectify import Trim
 
 TRIM = Trim([(np.array([0.0, 0.0, 115.0]), CUT_NORMAL)])
 PLAIN = Recipe(TRIM, flare_mm=0.0, distal="bearing")

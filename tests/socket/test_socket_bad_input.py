@@ -11,7 +11,7 @@ from limbfit.anatomy.grid import build_limb_frame
 from limbfit.anatomy.surfaces.surfaces import write_surface
 from limbfit.anatomy.surfaces.triangles import Surface, remove_unused_points
 from limbfit.socket import Recipe, rectify_limb
-from limbfit.socket.trim import Trim
+from limbfit.socket.rectify import Trim
 from small_limb import limb, revolved, small_limb
 
 NO_LINER = "[socket.liner]\nthickness_mm = 0.0\n"

@@ -9,7 +9,7 @@ from socket_limbs import CUT_NORMAL, round_limb
 from limbfit.anatomy.grid import build_limb_frame
 from limbfit.pipeline.socket.shape import mesh_edge_mm
 from limbfit.socket import Recipe, Socket, rectify_limb
-from limbfit.socket.trim import Trim
+from limbfit.socket.rectify import Trim
 from limbfit.study import Study, load_study
 from small_limb import small_limb
 

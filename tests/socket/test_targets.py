@@ -10,8 +10,8 @@ from limbfit.anatomy.grid import build_limb_frame
 from limbfit.errors import SurfaceError
 from limbfit.socket import Recipe, rectify_limb
 from limbfit.socket.landmarks import build_default_regions, find_directions
-from limbfit.socket.targets import PRESETS, TISSUE_DEPTH, Target, build_zone
-from limbfit.socket.trim import Trim
+from limbfit.socket.pressing import PRESETS, TISSUE_DEPTH, Target, build_zone
+from limbfit.socket.rectify import Trim
 
 LIMB = round_limb()
 REGIONS = build_default_regions(LIMB, find_directions(LIMB))

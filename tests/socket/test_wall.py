@@ -14,7 +14,7 @@ from limbfit.anatomy.surfaces.triangles import Surface, write_surface
 from limbfit.errors import SurfaceError
 from limbfit.socket import Area, Recipe, Socket, rectify_limb
 from limbfit.socket.landmarks import find_knee_centre
-from limbfit.socket.trim import Trim
+from limbfit.socket.rectify import Trim
 from limbfit.socket.wall import build_wall, measure_thickness
 
 RECIPE = Recipe(Trim([(np.array([0.0, 0.0, 112.0]), CUT_NORMAL)]), flare_mm=0.0)

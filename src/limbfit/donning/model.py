@@ -13,20 +13,9 @@ from ..anatomy.surfaces.triangles import Surface
 from ..arrays import Array
 from ..errors import ProblemError
 from ..execution import count_usable_cores
-from ..fe import (
-    History,
-    Motion,
-    Pressure,
-    Problem,
-    Result,
-    RigidBody,
-    SmoothSurface,
-    Step,
-    StepControl,
-    solve,
-)
+from ..fe import History, Pressure, Problem, Result, RigidBody, SmoothSurface, Step, StepControl, solve
 from ..fe.materials import Material
-from ..fe.motion import COORDINATES
+from ..fe.motion import COORDINATES, Motion
 from ..mesh import Mesh
 from ..socket import Socket
 

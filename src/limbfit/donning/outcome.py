@@ -12,21 +12,10 @@ from typing import Any, Self
 import numpy as np
 
 from ..arrays import Array, Mask
-from ..fe import (
-    Checkpoints,
-    Problem,
-    Result,
-    Snapshot,
-    State,
-    Step,
-    StepControl,
-    System,
-    Tractions,
-    compute_tractions,
-    solve,
-)
+from ..fe import Checkpoints, Problem, Result, Snapshot, State, Step, StepControl, System, solve
 from ..fe.kernel.laws import Laws
 from ..fe.observables import compute_element_fields
+from ..fe.tractions import Tractions, compute_tractions
 from .model import SocketFit, build_socket_steps
 
 Facts = dict[str, Any]

@@ -1,31 +1,14 @@
 """The mechanics: viscoelastic indentation of soft tissue by a rigid body, with exact sensitivities.
 
->>> from limbfit.bench.timing import build_layered_block
->>> from limbfit.fe import History, Indenter, OgdenQLV, Problem, StepControl, solve
->>> mesh = build_layered_block("tet10", 2)                                         # skin over muscle, mm
->>> skin = OgdenQLV(c=0.009, m=6.0, gamma=2.0, tau=0.5)                      # MPa, -, -, s
->>> muscle = OgdenQLV(c=0.005, m=5.0, gamma=1.0, tau=0.5)
->>> punch = Indenter("square", width=20.0, centre=(0, 0, 0), axis=(0, 0, -1))
->>> ramp = History(times=[0.0, 2.0, 4.0], displacement=[0.0, 2.0, 0.0])      # s, mm
->>> fixed, faces = mesh.node_sets["bottom"], mesh.face_sets["skin"]
->>> problem = Problem(mesh, {"skin": skin, "muscle": muscle}, fixed, faces, punch, ramp)
->>> result = solve(problem, steps=StepControl(load_steps=3, unload_steps=2), sensitivities=True)
->>> result.completed, result.force_at([1.0, 2.0]).shape                      # N
-(True, (2,))
->>> result.sensitivity_at([1.0, 2.0]).shape                                  # N per MPa, -, -, s
-(2, 8)
-
 Units: mm, N, s, MPa.  A problem that is impossible as stated raises `limbfit.errors.ProblemError`; one that
 cannot be solved to its end is a result with ``completed = False`` and a ``reason``.  A next simulation on
 the same mesh with other materials is quicker with ``warm_start=result`` of a run with ``store="all"``.
 """
 
 from ..shapes import RigidSurface as RigidSurface
-from .contact.open_surface import OpenSurface as OpenSurface
 from .contact.rigid import Indenter as Indenter
+from .contact.rigid import OpenSurface as OpenSurface
 from .contact.smooth_surface import SmoothSurface as SmoothSurface
-from .diagnostics import SimulationWarning as SimulationWarning
-from .diagnostics import list_texts as list_texts
 from .kernel.elements import ELEMENTS as ELEMENTS
 from .materials import ORDER_IN_TIME as ORDER_IN_TIME
 from .materials import VOLUMETRIC_LAWS as VOLUMETRIC_LAWS
@@ -47,8 +30,10 @@ from .problem import Problem as Problem
 from .problem import Support as Support
 from .problem import isochoric_stretch as isochoric_stretch
 from .result import Result as Result
+from .result import SimulationWarning as SimulationWarning
 from .result import State as State
 from .result import Step as Step
+from .result import list_texts as list_texts
 from .solution.compiling import are_compiled as are_compiled
 from .solution.compiling import compile_kernels as compile_kernels
 from .solution.control import StepControl as StepControl

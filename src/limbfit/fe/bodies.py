@@ -9,27 +9,16 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.sparse as sp
-from numpy.typing import NDArray
 
-from ..arrays import Array
-from .contact.contact import (
-    ContactSurface,
-    RigidShape,
-    Touch,
-    add_springs,
-    check_clear,
-    contact,
-    find_touching_offset,
-)
+from ..arrays import Array, Index, Mask
+from .contact.contact import ContactSurface, Touch, add_springs, check_clear, contact, find_touching_offset
 from .contact.friction import StickyContact
+from .contact.rigid import RigidShape
 from .contact.tool import Distances, Pose, Tool
 from .kernel.elements import Element
 from .motion import Drives, Motion, RigidBody
 from .pattern import Pattern, find_positions
 from .problem import Problem, ProblemError
-
-Index = NDArray[np.int32]
-
 
 # Stiffness that holds a coordinate while a displacement drives it which a force drives at other times, over
 # that of all its contact faces: it stays unknown, so that nothing is numbered anew.
@@ -245,7 +234,7 @@ class Bodies:
         """Stiffness (k,) of the free coordinates of bodies that touch nothing, N/mm, in tissue of a shear
         ``modulus``."""
         sizes = [np.full(len(body.free), body.start.width) for body in self.all]
-        return GROUNDING_STIFFNESS * modulus * np.concatenate(sizes)
+        return GROUNDING_STIFFNESS * modulus * np.concatenate([np.zeros(0), *sizes])
 
     def _holding_stiffness(self, body: _Body, penalty: float) -> float:
         """What holds a free coordinate where a displacement drives it, N/mm."""
@@ -321,7 +310,7 @@ class Bodies:
         touched[self.unknowns - self.free :] = touched.any()
         return np.flatnonzero(touched).astype(np.int32)
 
-    def find_points_on(self, unknowns: Index) -> NDArray[np.bool_]:
+    def find_points_on(self, unknowns: Index) -> Mask:
         """Contact points (c,) that move with these unknowns alone; none where there are none."""
         others = np.ones(self.unknowns)
         others[unknowns] = 0.0
@@ -367,7 +356,7 @@ class Bodies:
         return out
 
 
-def impose_coordinates(body: _Body, u: Array, value: Array, forced: NDArray[np.bool_]) -> Array:
+def impose_coordinates(body: _Body, u: Array, value: Array, forced: Mask) -> Array:
     """``u (r, 3)`` with the coordinates of a body at ``value (6,)`` that are free and not ``forced`` now."""
     held = np.zeros(6, dtype=bool)
     held[body.free] = ~forced[body.free]

@@ -16,6 +16,8 @@ from numba.core import cgutils
 from numba.extending import intrinsic
 from numpy.typing import NDArray
 
+from ..arrays import Indices
+
 _inlined: Any = intrinsic  # whose functions are called without their first argument, unknown to mypy
 LANES = 16
 _L = LANES
@@ -117,7 +119,7 @@ def _aligned(kind: np.dtype[Any], count: int) -> NDArray[Any]:
 
 
 @lru_cache
-def block_places(nodes: int) -> NDArray[np.int64]:
+def block_places(nodes: int) -> Indices:
     """Where the entries of the upper triangle (component-major) begin in the numbers of the BLOCKs."""
     r, c = np.triu_indices(3 * nodes)
     i, a, j, b = r // nodes, r % nodes, c // nodes, c % nodes

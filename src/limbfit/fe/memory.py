@@ -8,12 +8,14 @@ import numpy as np
 from numba import njit
 
 from ..arrays import Array
-from .kernel.laws import Laws
-from .kernel.response import add_material_fibre_stress, elastic_response, pull_back
+from .kernel.laws import EvaluationPoints, Laws
+from .kernel.response import elastic_response, pull_back
 from .lanes import LANES, workspace
 from .materials import compute_prony_factors
 from .motion import Drives
-from .system import Increment, Points, System
+from .system import Increment, System
+
+Points = System | EvaluationPoints  # those with a past of their own
 
 
 @dataclass(frozen=True)
@@ -92,9 +94,7 @@ def _compute_elastic_stresses(elements, tables, u, records, out):  # type: ignor
     for start in range(0, m, LANES):
         elastic_response(elements, start, tables, u, points, law[0], numbers)
         for t in range(q):
-            pull_back(points[t])
-            if len(elements[4]):
-                add_material_fibre_stress(points[t])
+            pull_back(points[t], len(elements[4]) > 0)
             for l in range(min(LANES, m - start)):
                 for i in range(6):
                     out[start + l, t, i] = points[t].tau[i, l]

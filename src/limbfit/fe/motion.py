@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from ..arrays import Array
+from ..arrays import Array, Indices, Mask
 from ..errors import ProblemError
 from .contact.rigid import RigidShape
 
@@ -36,7 +36,7 @@ class Motion:
 
     times: Array
     values: Array
-    forced: Sequence[bool] | NDArray[np.bool_] = (False,) * 6
+    forced: Sequence[bool] | Mask = (False,) * 6
     growth: Array | Sequence[float] | None = None
 
     def __post_init__(self) -> None:
@@ -123,7 +123,7 @@ class Motion:
         return float(np.clip((end - t) / (end - start), 0.0, 1.0))
 
     @property
-    def free(self) -> NDArray[np.bool_]:
+    def free(self) -> Mask:
         """(6,) which coordinates a force drives at some time."""
         return np.asarray(self.forced).max(axis=0).astype(bool)
 
@@ -132,7 +132,7 @@ class Motion:
         """True if its shape is ever another than the final one."""
         return bool((np.asarray(self.growth) != 1.0).any())
 
-    def at(self, t: float) -> tuple[Array, NDArray[np.bool_], float]:
+    def at(self, t: float) -> tuple[Array, Mask, float]:
         """The values (6,) at time ``t``, which of them are forces, and the growth; at the end of an interval,
         its own."""
         i = min(max(int(np.searchsorted(self.times, t)) - 1, 0), len(self.times) - 2)
@@ -169,7 +169,7 @@ class Drives:
     shapes have grown, ``growth (b,)``."""
 
     values: Array
-    forced: NDArray[np.bool_]
+    forced: Mask
     growth: Array
 
     @classmethod
@@ -203,7 +203,7 @@ class RigidBody:
     """
 
     shape: RigidShape
-    faces: NDArray[np.int64]
+    faces: Indices
     motion: Motion
     friction: str | float = "frictionless"
     pivot: Sequence[float] | Array | None = None

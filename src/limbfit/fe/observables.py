@@ -9,7 +9,7 @@ from numba import njit
 from ..arrays import Array, Indices
 from .kernel.elements import compute_face_areas
 from .kernel.laws import Laws
-from .kernel.response import add_fibre_stress, elastic_response, kirchhoff_stress, pressures
+from .kernel.response import elastic_response, kirchhoff_stress, pressures
 from .lanes import LANES, workspace
 from .result import State
 from .system import Increment, System
@@ -152,9 +152,7 @@ def _compute_fields(elements, mean, tables, history, u, records, out):  # type: 
                 out[start + l, 8] += w * np.sqrt(min(less, p.b[2, l]))
                 out[start + l, 9] += w * p.J[l]
                 out[start + l, 10] += w * (p.energy[l] + p.volumetric[l])
-            kirchhoff_stress(p)
-            if len(elements[4]):
-                add_fibre_stress(p)
+            kirchhoff_stress(p, len(elements[4]) > 0)
             for l in range(min(LANES, m - start)):
                 w = weights[start + l, t] / weights[start + l].sum() / p.J[l]
                 for i in range(6):

@@ -6,19 +6,20 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.sparse as sp
 from numba import njit
-from numpy.typing import NDArray
+
+from ..arrays import Index, Indices
 
 
 @dataclass(frozen=True)
 class Pattern:
     """The upper triangle in CSR form, and the number of each unknown (r, 3); -1: none."""
 
-    indptr: NDArray[np.int32]
-    indices: NDArray[np.int32]
-    numbers: NDArray[np.int32]
+    indptr: Index
+    indices: Index
+    numbers: Index
 
 
-def build_node_graph(cells: NDArray[np.int32], nodes: int) -> sp.csr_matrix:
+def build_node_graph(cells: Index, nodes: int) -> sp.csr_matrix:
     """Which nodes share a cell, themselves included; rows sorted."""
     m, k = cells.shape
     incidence = sp.csr_matrix(
@@ -29,7 +30,7 @@ def build_node_graph(cells: NDArray[np.int32], nodes: int) -> sp.csr_matrix:
     return graph
 
 
-def append_rows(graph: sp.csr_matrix, borders: Sequence[NDArray[np.int64]]) -> sp.csr_matrix:
+def append_rows(graph: sp.csr_matrix, borders: Sequence[Indices]) -> sp.csr_matrix:
     """A graph with two further rows for each of the ``borders``: they meet its nodes and each other."""
     n = graph.shape[0]
     size = n + 2 * len(borders)
@@ -50,9 +51,7 @@ def append_rows(graph: sp.csr_matrix, borders: Sequence[NDArray[np.int64]]) -> s
     return whole
 
 
-def build_upper_pattern(
-    numbers: NDArray[np.int32], graph: sp.csr_matrix
-) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+def build_upper_pattern(numbers: Index, graph: sp.csr_matrix) -> tuple[Index, Index]:
     """Upper triangle (indptr, indices) of the unknowns' graph, rows sorted, from that of the nodes."""
     kept = np.flatnonzero(numbers.ravel() >= 0)
     whole = sp.kron(graph.astype(np.int8), np.ones((3, 3), dtype=np.int8), format="bsr").tocsr()

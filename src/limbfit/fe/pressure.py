@@ -15,7 +15,7 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
-from ..arrays import Array
+from ..arrays import Array, Indices
 from .kernel.elements import Element
 from .motion import measure_moving_time, read_course
 from .pattern import Pattern, find_positions
@@ -32,7 +32,7 @@ class Pressure:
     values : (n,) MPa, positive when pushing inwards.
     """
 
-    faces: NDArray[np.int64]
+    faces: Indices
     times: Sequence[float] | Array
     values: Sequence[float] | Array
 
@@ -58,7 +58,7 @@ class Pressure:
 class PressedSurface:
     """The faces of one pressure as volume, its derivatives, and the forces of a unit of pressure."""
 
-    def __init__(self, element: Element, points: Array, faces: NDArray[np.int64]) -> None:
+    def __init__(self, element: Element, points: Array, faces: Indices) -> None:
         at, weights = element.face_rules["gauss"]
         self.N, self.dN = element.face_shape(at)
         self.weights, self.faces = weights, faces

@@ -7,9 +7,9 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from ..arrays import Array
+from ..arrays import Array, Indices
 from ..errors import ProblemError
 from ..mesh import Mesh
 from ..phases import MotionPhase, find_boundaries, find_loading_end, find_phases
@@ -28,10 +28,10 @@ class History:
     ``force (n,)``: the force, N, that presses it along its axis instead of a displacement.
     """
 
-    times: NDArray[np.float64]
-    displacement: NDArray[np.float64] | None = None
-    across: NDArray[np.float64] | None = None
-    force: NDArray[np.float64] | None = None
+    times: Array
+    displacement: Array | None = None
+    across: Array | None = None
+    force: Array | None = None
 
     def __post_init__(self) -> None:
         if (self.displacement is None) == (self.force is None):
@@ -52,13 +52,13 @@ class History:
         return self.force is not None
 
     @property
-    def driver(self) -> NDArray[np.float64]:
+    def driver(self) -> Array:
         """(n,) displacement, mm, or force, N."""
         values = self.displacement if self.force is None else self.force
         assert values is not None
         return values
 
-    def at(self, t: float | NDArray[np.float64]) -> NDArray[np.float64]:
+    def at(self, t: float | Array) -> Array:
         """Displacement, mm, or force, N, that drives it at time(s) ``t``."""
         return np.asarray(np.interp(t, self.times, self.driver))
 
@@ -94,14 +94,14 @@ class History:
         return History(np.append(0.0, self.times + seconds), **values)
 
     @property
-    def kinks(self) -> NDArray[np.float64]:
+    def kinks(self) -> Array:
         """Times where phases begin or end, or a move across the axis turns, s, both ends among them."""
         found = find_boundaries(self.phases)
         apart = np.abs(found[:, None] - self.turns).min(axis=0, initial=np.inf) > 1e-9 * self.times[-1]
         return np.union1d(found, self.turns[apart])
 
     @property
-    def turns(self) -> NDArray[np.float64]:
+    def turns(self) -> Array:
         """Times where a move across the axis turns, s."""
         if self.across is None:
             return np.zeros(0)
@@ -120,7 +120,7 @@ class History:
 class Support:
     """Nodes whose displacement ``component`` (0, 1, 2) is ``factor`` times the history's displacement."""
 
-    nodes: NDArray[np.int64]
+    nodes: Indices
     component: int
     factor: float = 0.0
 
@@ -159,8 +159,8 @@ class Problem:
 
     mesh: Mesh
     materials: Mapping[str, Material]
-    fixed: NDArray[np.int64]
-    contact_faces: NDArray[np.int64]
+    fixed: Indices
+    contact_faces: Indices
     indenter: Indenter | None
     history: History
     supports: tuple[Support, ...] = ()
@@ -200,7 +200,7 @@ class Problem:
         """What drives the rigid bodies at time ``t``."""
         return Drives.of([body.motion for body in self.rigid_bodies], t)
 
-    def take_over_forces(self, t: float, reactions: NDArray[np.float64]) -> Problem:
+    def take_over_forces(self, t: float, reactions: Array) -> Problem:
         """The problem with the ``reactions (b, 6)`` of the bodies as the forces left open at time ``t``."""
         first = len(self.rigid_bodies) - len(self.bodies)
         moved = [body.motion.take_over_forces(t, reactions[first + i]) for i, body in enumerate(self.bodies)]
@@ -244,7 +244,7 @@ class Problem:
         return 0.0 if self.activation is None else self.activation.at(t)
 
     @property
-    def turns(self) -> NDArray[np.float64]:
+    def turns(self) -> Array:
         """Times at which a further body, a pressure or the activation turns, or contact begins, s."""
         knots = [np.asarray(one.times)[1:] for one in self.pressures]
         if self.touch_down_s:
@@ -254,7 +254,7 @@ class Problem:
         return np.unique(np.concatenate([np.zeros(0), *(body.motion.turns for body in self.bodies), *knots]))
 
     @property
-    def kinks(self) -> NDArray[np.float64]:
+    def kinks(self) -> Array:
         """Times, s, at which answers may have a kink: a phase of the indenter ends, or something turns."""
         return np.union1d(self.history.kinks, self.turns)
 
@@ -273,7 +273,7 @@ class Problem:
         )
 
     @property
-    def parameters(self) -> NDArray[np.float64]:
+    def parameters(self) -> Array:
         """Values in the order of `parameter_names`; mm, N, s, MPa."""
         return np.array([v for region in self.mesh.region_names for v in self.materials[region].parameters])
 

@@ -7,12 +7,13 @@ every entry of every element's upper triangle knows its place in it.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
+from functools import cache
 from itertools import pairwise
-from typing import Protocol, TypeVar
+from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..arrays import Array
 from .bodies import Bodies, Contacts, count_body_rows
@@ -28,9 +29,14 @@ from .motion import Drives
 from .pattern import Pattern, append_rows, build_node_graph, build_upper_pattern, find_positions
 from .pressure import Pressures
 from .problem import Problem, ProblemError
-from .threads import get_thread_pool
 
 T = TypeVar("T")
+
+
+@cache
+def get_thread_pool(threads: int) -> ThreadPoolExecutor:
+    """Workers for compiled kernels that let go of the interpreter; kept for the life of the process."""
+    return ThreadPoolExecutor(threads)
 
 
 @dataclass(frozen=True)
@@ -95,18 +101,6 @@ class Evaluation:
         if self.data is None:
             raise ValueError("the tangent was not evaluated")
         return self.data
-
-
-class Points(Protocol):
-    """Points with a history of their own: the quadrature points of a `System`, or places elsewhere."""
-
-    @property
-    def weights(self) -> Array:
-        """(m, q) of q points in each of m elements, mm^3."""
-
-    @property
-    def regions(self) -> NDArray[np.int32]:
-        """(m,) of the elements."""
 
 
 class System:

@@ -5,9 +5,8 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ..arrays import Array
+from ..arrays import Array, Indices
 from ..renamed import find_renamed
 from .contact.contact import ContactSurface
 from .kernel.laws import Laws
@@ -31,7 +30,7 @@ class Tractions:
     forces : (f, q, 3) on the tissue, N.
     """
 
-    faces: NDArray[np.int64]
+    faces: Indices
     shares: Array
     points: Array
     areas: Array

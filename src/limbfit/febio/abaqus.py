@@ -17,11 +17,9 @@ from ..arrays import Indices
 from ..errors import ProblemError
 from ..fe import Indenter, Material, Problem, System
 from ..mesh import Mesh
-from .conditions import FIXED_SET
-from .meshes import FRONT, INDENTER, PATCH, RigidMesh, build_indenter_mesh
+from .bodies import FIXED_SET, FRONT, INDENTER, PATCH, RigidMesh, build_indenter_mesh
 from .penalty import compute_explicit_penalty, find_cells_behind
-from .rendering import write_template
-from .writing import FebSettings, check_simple_indentation
+from .writing import FebSettings, check_simple_indentation, write_template
 
 _ELEMENT = {"tet4": "C3D4", "tet10": "C3D10", "tet10p0": "C3D10H", "tet10g8": "C3D10", "hex8": "C3D8"}
 # Faces of Abaqus' elements, S1 to S6, as corners of the element (from 0).

@@ -16,8 +16,8 @@ import numpy as np
 from ..arrays import Array
 from ..errors import ProblemError
 from ..fe import Indenter, Problem
-from .meshes import INDENTER
-from .rendering import write_template
+from .bodies import INDENTER
+from .writing import write_template
 
 MAX_PARAMETERS = 64  # parameters, in FEBio
 

@@ -11,7 +11,7 @@ Source: FEBio User Manual 4.0, chapter 4, and the section on ``MeshData``; ``FEA
 """
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
@@ -19,24 +19,29 @@ from typing import Any
 from xml.sax.saxutils import escape
 
 import numpy as np
+from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
 from markupsafe import Markup
 
 from ..arrays import Array
-from ..errors import ProblemError
+from ..errors import ProblemError, RunError
 from ..fe import Motion, Problem, StepControl
 from ..fe.solution.control import schedule_steps
 from ..mesh import Mesh
-from .conditions import FIXED_SET, FRAME_BODY, CurveList, find_step_ends, list_conditions
-from .meshes import (
+from .bodies import (
+    FIXED_SET,
+    FRAME_BODY,
     FRONT,
     INDENTER,
     PATCH,
     QUADRATURE,
+    CurveList,
     FebBody,
     RigidMesh,
     build_bodies,
     build_frame_mesh,
+    find_step_ends,
     has_round_edges,
+    list_conditions,
     list_parts,
     name_node_sets,
     name_surfaces,
@@ -45,7 +50,6 @@ from .penalty import compute_explicit_penalty, compute_mean_stiffness
 from .preparation import PRESTRAIN_S, Preparation, prepare_problem
 from .reading.materials import ACTIVE, FIBRE, FIRST_AXIS, GRADIENT, MIXTURE, PRESTRAINED, RELAXED
 from .reading.model import Contact
-from .rendering import write_template
 
 REST = Motion(np.array([0.0, 1.0]), np.zeros((2, 6)))
 PRESSURE_MODELS = {0: "default", 1: "NIKE3D", 2: "Abaqus"}
@@ -350,3 +354,48 @@ def _find_fibre_directions(problem: Problem) -> dict[str, Array]:
     """
     found = {} if problem.fibres is None else _divide_by_region(problem.mesh, problem.fibres, (3,))
     return {name: own for name, own in found.items() if problem.materials[name].table().has_fibres}
+
+
+def format_row(values: Iterable[float]) -> str:
+    """Write numbers with commas, so that they are read back exactly."""
+    return ",".join(repr(float(value)) for value in values)
+
+
+def format_fields(values: Iterable[float]) -> str:
+    """Write numbers with commas, each in the 20 characters that Abaqus and CalculiX take at most."""
+    return ", ".join(f"{float(value):.12g}" for value in values)
+
+
+def format_ids(nodes: Iterable[int]) -> str:
+    """Write nodes as FEBio's numbers, which count from 1."""
+    return ",".join(str(int(node) + 1) for node in nodes)
+
+
+def wrap_numbers(numbers: Iterable[int]) -> str:
+    """Write at most 15 numbers in a line, as Abaqus asks; a line that continues ends with a comma."""
+    listed = [str(int(number)) for number in numbers]
+    return ",\n".join(", ".join(listed[i : i + 15]) for i in range(0, len(listed), 15))
+
+
+def find_across(direction: Array) -> Array:
+    """Return the axis of space (3,) that is most across a direction (3,)."""
+    return np.asarray(np.eye(3)[np.argmin(np.abs(direction))])
+
+
+def write_template(path: str | Path, template: str, **content: Any) -> None:
+    """Write a file from one of the templates; raise `RunError` if it cannot be written."""
+    environment = Environment(
+        loader=PackageLoader("limbfit.febio", "templates"),
+        autoescape=select_autoescape(("feb.j2",)),
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+    )
+    environment.filters |= {"row": format_row, "fields": format_fields, "ids": format_ids}
+    environment.filters |= {"wrap": wrap_numbers, "across": find_across}
+    text = environment.get_template(template).render(content)
+    try:
+        Path(path).write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise RunError(f"{path}: {error.strerror or error}") from error

@@ -27,8 +27,7 @@ import numpy as np
 from ..arrays import Array, Indices, Mask
 from ..errors import ProblemError
 from ..fe import Indenter, Material, Result
-from ..fe.kernel.evaluation_points import EvaluationPoints, evaluate_elastic_at
-from ..fe.kernel.laws import Laws
+from ..fe.kernel.laws import EvaluationPoints, Laws, evaluate_elastic_at
 from ..fe.memory import Memory
 from ..fe.result import interpolate
 from ..mesh import Gauge, Mesh, find_gauges_along, locate, read_vtu

@@ -34,7 +34,7 @@ from ..errors import InputError
 from ..indentation import Parameters
 from ..socket import Area, Recipe, Socket, read_socket, rectify_limb
 from ..socket.landmarks import Directions, build_default_regions, find_directions, find_knee_centre
-from ..socket.trim import Trim
+from ..socket.rectify import Trim
 from . import geometry, robot
 from .geometry import SKIN_AND_FAT, SKIN_LAYER, TENDON, Limb
 from .mri import DETAIL_GRIDS, LABELS_FILE, TENDON_LABEL, build_true_labels, make_grid, write_series

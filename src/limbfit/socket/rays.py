@@ -4,7 +4,8 @@ The middle line follows the centres of the limb's sections down to the centre of
 on up rays run across the limb frame's z axis; below, they leave that centre in all distal directions. A point
 has three coordinates: its angle around the limb, its station (mm: height over the centre, or the arc below
 it, which is negative) and its radius. Rays do not cross, so a face that has one radius for each angle and
-station cannot fold. `Offsets` are moves along them, such as the shape that pressures give a socket.
+station cannot fold. `Offsets` are moves along them, such as the shape that pressures give a socket, and
+along them a face is moved clear of the limb.
 """
 
 from collections.abc import Callable
@@ -14,10 +15,11 @@ from functools import lru_cache
 import numpy as np
 from scipy.interpolate import RegularGridInterpolator
 from scipy.ndimage import gaussian_filter
+from scipy.sparse import csr_array
 
 from ..anatomy.grid import Frame, format_place
-from ..anatomy.surfaces.triangles import Surface
-from ..arrays import Array
+from ..anatomy.surfaces.triangles import Surface, find_half_edges
+from ..arrays import Array, Indices
 from ..errors import SurfaceError
 from .shape import cut_section, measure_section
 
@@ -28,6 +30,9 @@ DEGREE = 3  # of the middle line
 LEVELS = 60
 SMOOTH_MM = 1.5  # roughness that is shorter is not the limb's shape
 FOLD_MM = 1.0  # a ray that meets the surface again so much farther out meets a fold
+CLEAR_MM = 0.5  # between face and limb: what is promised
+TARGET_MM = 0.8  # what is aimed at where it is measured
+MAX_ROUNDS = 12  # of moving a face clear
 OFFSET_SMOOTH_MM = 5.0  # half of an edge of the limb's mesh: what is shorter is that of its faces
 
 
@@ -229,3 +234,44 @@ def compute_offsets(limb: LimbProfile, before: Surface, after: Surface, frame: F
         )
     radial[known[-1] + 1 :] = radial[known[-1]]
     return Offsets(limb, smooth(radial, limb.stations, float(np.median(first[known])), OFFSET_SMOOTH_MM))
+
+
+def apply_clearance(points: Array, faces: Indices, limb: LimbProfile, outer: Surface, frame: Frame) -> Array:
+    """Move the points of a face (limb frame) until it is clear of the limb by ``CLEAR_MM`` or more.
+
+    Each stays on its ray and moves outwards only. What is measured are the face's points, middles of edges
+    and faces, and the limb's points. Raises `SurfaceError` where that takes more than ``MAX_ROUNDS`` rounds.
+    """
+    local = Surface(frame.to_limb(outer.points), outer.faces)
+    angle, station, radius = limb.rays.coordinates(points)
+    edges = find_half_edges(faces)
+    both = np.vstack([edges, edges[:, ::-1]])
+    neighbours = csr_array((np.ones(len(both)), (both[:, 0], both[:, 1])), shape=(len(points), len(points)))
+    radius = np.maximum(radius, limb.at(angle, station) + TARGET_MM)
+    for _ in range(MAX_ROUNDS):
+        moved = limb.rays.points(angle, station, radius)
+        need = _compute_moves(moved, faces, local)
+        if need.max() <= TARGET_MM - CLEAR_MM:
+            return moved
+        # A point's neighbours go with it, so that the face stays smooth.
+        beside = neighbours.multiply(need[None, :]).max(axis=1).toarray().ravel()
+        radius = radius + 1.3 * np.maximum(need, 0.5 * beside)
+    raise SurfaceError(
+        "the socket cannot be moved clear of the limb",
+        remedy="smooth the limb's surface, or trim below where it is folded",
+    )
+
+
+def _compute_moves(points: Array, faces: Indices, limb: Surface) -> Array:
+    """Compute by how much each point (n,) should move out so that all measured near it is clear, mm."""
+    need = np.maximum(TARGET_MM - limb.signed_distance(points), 0.0)
+    for corners in ((0, 1), (1, 2), (2, 0), (0, 1, 2)):
+        ends = faces[:, list(corners)]
+        short = np.maximum(TARGET_MM - limb.signed_distance(points[ends].mean(axis=1)), 0.0)
+        for end in ends.T:
+            np.maximum.at(need, end, short)
+    squared, nearest, _ = Surface(points, faces).find_nearest(limb.points)
+    short = np.maximum(TARGET_MM - np.sqrt(squared), 0.0)
+    for end in faces[nearest].T:
+        np.maximum.at(need, end, short)
+    return need

@@ -18,9 +18,8 @@ from ..anatomy.surfaces.triangles import (
 )
 from ..arrays import Array, Indices
 from ..errors import SurfaceError, add_location
-from .clearance import apply_clearance, refuse_bones
-from .rays import Rays, compute_profile
-from .shape import Socket
+from .rays import Rays, apply_clearance, compute_profile
+from .shape import Socket, refuse_bones
 
 MIN_SIZE_RATIO, MAX_SIZE_RATIO = 0.25, 3.0  # of the limb's length, end to end: otherwise another unit
 LOOSE_SHARE = 0.01  # of the faces: pieces that hold less are left out

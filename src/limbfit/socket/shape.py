@@ -1,14 +1,19 @@
-"""A socket's inner face: an open triangle surface around a limb, and what is measured on it."""
+"""A socket's inner face: an open triangle surface around a limb, what is measured on it, and bones inside."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ..anatomy.grid import Frame
 from ..anatomy.surfaces.mending import open_loops
 from ..anatomy.surfaces.triangles import Surface
 from ..arrays import Array, Indices, Mask
+from ..errors import SurfaceError
+
+BONE_ROUGHNESS_MM = 0.5  # by which a bone may reach through the face: roughness
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,3 +100,41 @@ def measure_section(segments: Array) -> Array:
     twice = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
     area = twice.sum() / 2
     return np.append((twice[:, None] * (a + b)).sum(axis=0) / (6 * area), abs(area))
+
+
+def refuse_bones(
+    face: Surface,
+    brim: Indices,
+    frame: Frame,
+    bones: Mapping[str, Surface],
+    *,
+    remedy: str,
+    spare_mm: float = 0.0,
+) -> None:
+    """Refuse a face that a bone reaches through, below the brim and above an open end.
+
+    Parameters
+    ----------
+    face, brim : of a `Socket`, LPS mm.
+    frame : of the limb.
+    bones : closed surfaces, LPS mm.
+    spare_mm : how far a bone may do so besides roughness: a liner that the face was drawn without.
+
+    Raises
+    ------
+    SurfaceError
+        With the bone, how far it reaches through, and the remedy.
+    """
+    face = Surface(frame.to_limb(face.points), face.faces)
+    closed = close_by_fans(face.flipped)
+    lowest = float(face.points[brim, 2].min())
+    ends = [face.points[loop, 2].max() for loop in open_loops(face) if loop[0] not in brim]
+    for name, bone in bones.items():
+        local = frame.to_limb(bone.points)
+        height = local[:, 2]
+        below = local[(height < lowest - BONE_ROUGHNESS_MM) & (height > max(ends, default=-np.inf))]
+        if not len(below):
+            continue
+        out = float(closed.signed_distance(below).max()) - spare_mm
+        if out > BONE_ROUGHNESS_MM:
+            raise SurfaceError(f"the socket cuts {out:.1f} mm into the bone {name}", remedy=remedy)

@@ -17,7 +17,7 @@ from ..pipeline.socket.shape import build_regions, build_socket, place_errors, t
 from ..results.socket import SocketDesignResult, SocketLoad, SocketResult, SocketSimulation, SocketState
 from ..socket import Socket
 from ..socket.rays import compute_profile
-from ..socket.trim import Trim, find_brim, trim_limb, wrap_trimline
+from ..socket.rectify import Trim, find_brim, trim_limb, wrap_trimline
 from ..study import Study
 from ..web import build_patient_frame, to_volume_shape
 from .editing import remove_area, set_area, set_trimline

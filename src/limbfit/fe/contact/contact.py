@@ -13,9 +13,8 @@ from functools import cached_property
 import numpy as np
 import scipy.sparse as sp
 from numba import njit
-from numpy.typing import NDArray
 
-from ...arrays import Array
+from ...arrays import Array, Indices, Mask
 from ...errors import ProblemError
 from ..kernel.elements import Element, build_face_quadrature
 from .rigid import RigidShape
@@ -30,13 +29,13 @@ class ContactSurface:
     With the nodal rule a "face" is one node (k = q = 1) that stands for its share of the area.
     """
 
-    faces: NDArray[np.int64]
+    faces: Indices
     N: Array
     areas: Array
     points: Array
 
     @classmethod
-    def build(cls, element: Element, points: Array, faces: NDArray[np.int64], rule: str) -> ContactSurface:
+    def build(cls, element: Element, points: Array, faces: Indices, rule: str) -> ContactSurface:
         N, areas = build_face_quadrature(element, points, faces, rule)
         if rule == "nodes":
             nodes, owner = np.unique(faces[:, N.argmax(axis=1)], return_inverse=True)
@@ -82,10 +81,10 @@ class Touch:
     forces: Array
 
     @property
-    def closed(self) -> NDArray[np.bool_]:
+    def closed(self) -> Mask:
         return self.gaps < 0.0
 
-    def under(self, closed: NDArray[np.bool_]) -> tuple[Array, Array]:
+    def under(self, closed: Mask) -> tuple[Array, Array]:
         """Blocks (c, 3, 3) and the change of the contact forces (c, 3) were ``closed`` the points in touch.
 
         A point that closes pulls until it touches; one that opens is let go.

@@ -33,13 +33,10 @@ from dataclasses import dataclass, replace
 from typing import ClassVar, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ...arrays import Array
+from ...arrays import Array, Mask
 from .contact import ContactSurface
 from .tool import Distances, Tool
-
-Bools = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -55,7 +52,7 @@ class StickyContact(ABC):
     pulls : (f, q, 3) the dual variable, mm: the part of the slip that pulls, as the tangent takes it to be.
     """
 
-    held: Bools
+    held: Mask
     places: Array
     normals: Array
     bounds: Array
@@ -66,7 +63,7 @@ class StickyContact(ABC):
     lags: ClassVar[bool] = False  # True if a step holds something constant that follows u (`coupling`)
 
     @property
-    def arrays(self) -> tuple[Bools, Array, Array, Array, Array]:
+    def arrays(self) -> tuple[Mask, Array, Array, Array, Array]:
         """What the contact kernel takes of it, point by point."""
         places, normals, pulls = (x.reshape(-1, 3) for x in (self.places, self.normals, self.pulls))
         return self.held.ravel(), places, normals, self.bounds.ravel(), pulls
@@ -271,7 +268,7 @@ class _Slip:
 
     move: Array
     unit: Array
-    stuck: NDArray[np.bool_]
+    stuck: Mask
     elastic: Array
     share: Array
     tangent: Array

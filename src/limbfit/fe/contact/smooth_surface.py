@@ -26,7 +26,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from ...arrays import Array
+from ...arrays import Array, Indices, Mask
 from ...errors import ProblemError
 from ...shapes.triangles import (
     Tree,
@@ -37,7 +37,7 @@ from ...shapes.triangles import (
     feature_normal,
     find_neighbours,
 )
-from .open_surface import Wall, check_open_surface
+from .rigid import Wall, check_open_surface, compute_features
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,7 +115,7 @@ class SmoothSurface(Wall):
         other.__dict__["growth"] = share
         return other
 
-    def near(self, points: Array) -> NDArray[np.bool_]:
+    def near(self, points: Array) -> Mask:
         place = (points - self.grid.low) / self.grid.spacing
         return np.asarray(((place >= 1.0) & (place < np.array(self.grid.shape) - 2.0)).all(axis=1))
 
@@ -179,20 +179,14 @@ class DistanceGrid:
         return cls(low, spacing, (x, y, z))
 
 
-def fit_spline_coefficients(
-    grid: DistanceGrid, points: Array, faces: NDArray[np.int64], reach: float
-) -> Array:
+def fit_spline_coefficients(grid: DistanceGrid, points: Array, faces: Indices, reach: float) -> Array:
     """(2, x, y, z) of the distance from the wall, positive on the side from which its triangles run
     counter-clockwise, and of the way beyond its brim, mm.
 
     Not a number where a spline would need samples farther away than the reach.
     """
     whole, all_faces = _extend_past_brim(points, faces, PAST * grid.spacing)
-    corners = np.ascontiguousarray(whole[all_faces])
-    normals = compute_triangle_normals(corners)[0]
-    sums = compute_normal_spread(whole, all_faces, normals)[1]
-    beyond = find_neighbours(all_faces)
-    edges = normals[:, None] + np.where(beyond[..., None] >= 0, normals[beyond], 0.0)
+    corners, normals, edges, sums = compute_features(whole, all_faces)
     own, past = np.arange(len(faces)), np.arange(len(faces), len(all_faces))
     trees: tuple[Tree, Tree, Tree] = (
         build_tree(corners, np.arange(len(corners))),
@@ -200,7 +194,7 @@ def fit_spline_coefficients(
         build_tree(corners, past if len(past) else own),
     )
     out = np.full((2, *grid.shape), np.nan)
-    facets = corners, normals, edges, sums[all_faces], trees
+    facets = corners, normals, edges, sums, trees
     _sample(facets, len(faces), len(past) > 0, grid.low, grid.spacing, reach + MARGIN * grid.spacing, out)
     for axis in (1, 2, 3):
         inner = np.moveaxis(out, axis, 0)
@@ -210,7 +204,7 @@ def fit_spline_coefficients(
     return out
 
 
-def _extend_past_brim(points: Array, faces: NDArray[np.int64], by: float) -> tuple[Array, NDArray[np.int64]]:
+def _extend_past_brim(points: Array, faces: Indices, by: float) -> tuple[Array, Indices]:
     """The surface with a strip of ``by`` mm past its brim; the strip's faces are the last ones."""
     ahead = np.roll(faces, -1, axis=1)
     brim = find_neighbours(faces) < 0

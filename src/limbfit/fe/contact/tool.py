@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import expm
 
-from ...arrays import Array
+from ...arrays import Array, Indices, Mask
 from .contact import ContactSurface
 from .rigid import RigidShape
 
@@ -194,14 +194,14 @@ class Distances:
     ``gaps (k,)``, mm, their gradients ``slopes (k, 3)`` and hessians ``bends (k, 3, 3)``, 1/mm.
     """
 
-    points: NDArray[np.int64]
+    points: Indices
     places: Array
     gaps: Array
     slopes: Array
     bends: Array
 
     @classmethod
-    def of(cls, tool: Tool, also: NDArray[np.bool_] | None = None) -> Distances:
+    def of(cls, tool: Tool, also: Mask | None = None) -> Distances:
         """From the body where it is; ``also (f, q)`` points far away."""
         local = tool.local.reshape(-1, 3)
         near = tool.body.near(local)

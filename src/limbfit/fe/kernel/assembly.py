@@ -10,22 +10,13 @@ from pathlib import Path
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
-from ...arrays import Array
+from ...arrays import Array, Index
 from ..lanes import COMPILED, LANES, block_places, prefetch, workspace
 from .laws import Tables
-from .response import (
-    add_fibre_stress,
-    add_weighted_fibre_moduli,
-    elastic_response,
-    kirchhoff_stress,
-    pressures,
-    weighted_moduli,
-)
+from .response import elastic_response, kirchhoff_stress, pressures, weighted_moduli
 
-Indices = NDArray[np.int32]
-Elements = tuple[Indices, Array, Array, Indices, Array, Array]
+Elements = tuple[Index, Array, Array, Index, Array, Array]
 
 
 def assemble(
@@ -36,7 +27,7 @@ def assemble(
     history: Array,
     u: Array,
     tangent: bool,
-    positions: Indices,
+    positions: Index,
     residual: Array,
     data: Array,
 ) -> float:
@@ -88,9 +79,7 @@ def _assemble(  # type: ignore[no-untyped-def]
         for a in range(k):
             _clear_force(forces[a])
         for t in range(q):
-            kirchhoff_stress(points[t])
-            if len(fibres):
-                add_fibre_stress(points[t])
+            kirchhoff_stress(points[t], len(fibres) > 0)
             for l in range(LANES):
                 energy += points[t].energy[l]
             for a in range(k):
@@ -103,9 +92,7 @@ def _assemble(  # type: ignore[no-untyped-def]
             continue
         _prefetch_entries(positions[start], k, data)
         for t in range(q):
-            weighted_moduli(points[t], element[0])
-            if len(fibres):
-                add_weighted_fibre_moduli(points[t], element[0])
+            weighted_moduli(points[t], element[0], len(fibres) > 0)
         _fill_blocks(points, at_points, forces, element[0], blocks)
         for l in range(count):
             if start + l + 1 < m:

@@ -8,9 +8,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ...arrays import Array
+from ...arrays import Array, Indices
 from ...mesh.cells import QUAD_CORNERS, ShapeFunctions, linear_simplex, linear_tensor, quadratic_simplex
 
 
@@ -101,9 +100,7 @@ ELEMENTS: dict[str, Element] = {
 }
 
 
-def compute_reference_gradients(
-    element: Element, points: Array, cells: NDArray[np.int64]
-) -> tuple[Array, Array]:
+def compute_reference_gradients(element: Element, points: Array, cells: Indices) -> tuple[Array, Array]:
     """Gradients (m, q, 3, k) of the shape functions in the reference configuration and weights (m, q), mm^3.
 
     A weight is not positive where the cell is inverted.
@@ -119,17 +116,13 @@ def compute_reference_gradients(
     return np.ascontiguousarray(gradients), np.ascontiguousarray(weights)
 
 
-def build_face_quadrature(
-    element: Element, points: Array, faces: NDArray[np.int64], rule: str
-) -> tuple[Array, Array]:
+def build_face_quadrature(element: Element, points: Array, faces: Indices, rule: str) -> tuple[Array, Array]:
     """Shape values (q, k) and areas (f, q), mm^2, at the points of a face rule."""
     N, areas = compute_face_areas(element, points, faces, rule)
     return N, np.linalg.norm(areas, axis=-1)
 
 
-def compute_face_areas(
-    element: Element, points: Array, faces: NDArray[np.int64], rule: str
-) -> tuple[Array, Array]:
+def compute_face_areas(element: Element, points: Array, faces: Indices, rule: str) -> tuple[Array, Array]:
     """Shape values (q, k) and areas (f, q, 3) as outward vectors, mm^2, at the points of a face rule."""
     at, weights = element.face_rules[rule]
     N, dN = element.face_shape(at)

@@ -282,7 +282,7 @@ def pressures(weights, regions, tables, mean, start, points, element):  # type: 
 
 
 @njit(**COMPILED)
-def kirchhoff_stress(p):  # type: ignore[no-untyped-def]
+def kirchhoff_stress(p, has_fibres):  # type: ignore[no-untyped-def]
     """Kirchhoff stress ``tau`` of a POINT; its ``energy`` becomes the potential, N mm."""
     for l in range(LANES):
         s, pressure = p.scale[l], p.pressure[l]
@@ -307,25 +307,14 @@ def kirchhoff_stress(p):  # type: ignore[no-untyped-def]
         p.tau[3, l] = b0 * X0 * Y0 + b1 * X1 * Y1 + b2 * X2 * Y2 + u0 * y0 + u1 * y1 + u2 * y2
         p.tau[4, l] = b0 * Y0 * Z0 + b1 * Y1 * Z1 + b2 * Y2 * Z2 + v0 * z0 + v1 * z1 + v2 * z2
         p.tau[5, l] = b0 * Z0 * X0 + b1 * Z1 * X1 + b2 * Z2 * X2 + w0 * x0 + w1 * x1 + w2 * x2
+    if has_fibres:
+        _add_fibre_stress(p, p.fibre, True)
 
 
 @njit(**COMPILED)
-def add_fibre_stress(p):  # type: ignore[no-untyped-def]
-    """Add the fibres' part of the Kirchhoff stress to ``tau`` of a POINT, scaled."""
-    for l in range(LANES):
-        T, x, y, z = p.scale[l] * p.fibre_tension[l], p.fibre[0, l], p.fibre[1, l], p.fibre[2, l]
-        p.tau[0, l] += T * x * x
-        p.tau[1, l] += T * y * y
-        p.tau[2, l] += T * z * z
-        p.tau[3, l] += T * x * y
-        p.tau[4, l] += T * y * z
-        p.tau[5, l] += T * z * x
-
-
-@njit(**COMPILED)
-def pull_back(p):  # type: ignore[no-untyped-def]
-    """Pull a POINT back: ``v_i = F^-1 n_i`` in the place of ``n``, ``Se = sum_i beta_i v_i x v_i`` in that of
-    ``tau``."""
+def pull_back(p, has_fibres):  # type: ignore[no-untyped-def]
+    """Pull a POINT back: ``v_i = F^-1 n_i`` in the place of ``n``, ``Se = sum_i beta_i v_i x v_i``, and what
+    fibres add to it, in that of ``tau``."""
     for l in range(LANES):
         f00, f10, f20 = p.inverse[0, 0, l], p.inverse[1, 0, l], p.inverse[2, 0, l]
         f01, f11, f21 = p.inverse[0, 1, l], p.inverse[1, 1, l], p.inverse[2, 1, l]
@@ -336,14 +325,16 @@ def pull_back(p):  # type: ignore[no-untyped-def]
             p.n[1, i, l] = f01 * x + f11 * y + f21 * z
             p.n[2, i, l] = f02 * x + f12 * y + f22 * z
     _sum_dyads(p, p.beta, p.tau)
+    if has_fibres:
+        _add_fibre_stress(p, p.material_fibre, False)
 
 
-@njit(**COMPILED)
-def add_material_fibre_stress(p):  # type: ignore[no-untyped-def]
-    """Add the fibres' part of ``Se`` to ``tau`` of a POINT that is pulled back."""
+@njit(forceinline=True, **COMPILED)
+def _add_fibre_stress(p, m, scaled):  # type: ignore[no-untyped-def]
+    """Add the stress of fibres along ``m (3, lanes)`` to ``tau`` of a POINT, ``scaled`` or as it is."""
     for l in range(LANES):
-        T = p.fibre_tension[l]
-        x, y, z = p.material_fibre[0, l], p.material_fibre[1, l], p.material_fibre[2, l]
+        T = p.scale[l] * p.fibre_tension[l] if scaled else p.fibre_tension[l]
+        x, y, z = m[0, l], m[1, l], m[2, l]
         p.tau[0, l] += T * x * x
         p.tau[1, l] += T * y * y
         p.tau[2, l] += T * z * z
@@ -391,18 +382,22 @@ def stress_rates(p, law, numbers, rates):  # type: ignore[no-untyped-def]
 
 
 @njit(**COMPILED)
-def elastic_moduli(p, element):  # type: ignore[no-untyped-def]
-    """Elastic moduli ``D`` (6 x 6) of a POINT: spatial ones; material ones ``dSe/dE`` once it is pulled back.
+def elastic_moduli(p, element, has_fibres):  # type: ignore[no-untyped-def]
+    """Elastic moduli ``D`` (6 x 6) of a POINT that is pulled back, ``dSe/dE``, those of fibres among them.
 
     ``sum_ij (d beta_i/de_j - 2 beta_i delta_ij) n_i n_i n_j n_j`` and the shear terms
     ``(beta_i c2_j - beta_j c2_i)/(c2_i - c2_j)``.
     """
     _principal_moduli(p, element)
     _combine_moduli(p, element)
+    if has_fibres:
+        for l in range(LANES):
+            element.factor_of_fibre[l] = 1.0
+        _add_fibre_moduli(p, element, p.material_fibre)
 
 
 @njit(**COMPILED)
-def weighted_moduli(p, element):  # type: ignore[no-untyped-def]
+def weighted_moduli(p, element, has_fibres):  # type: ignore[no-untyped-def]
     """All spatial moduli ``D`` (6 x 6) of a POINT, times its weight: scaled elastic ones and the pressure's.
 
     These are ``stiffening I x I - 2 p`` times the symmetric identity: sum_i n_i n_i is the identity.
@@ -416,6 +411,10 @@ def weighted_moduli(p, element):  # type: ignore[no-untyped-def]
             element.along[3 + i, l] = s * element.along[3 + i, l] + stiffening
             element.along[6 + i, l] = s * element.along[6 + i, l] - pressure
     _combine_moduli(p, element)
+    if has_fibres:
+        for l in range(LANES):
+            element.factor_of_fibre[l] = p.weight[l] * p.scale[l]
+        _add_fibre_moduli(p, element, p.fibre)
 
 
 @njit(forceinline=True, **COMPILED)
@@ -487,22 +486,6 @@ def _dyads(p, axes, s, i, j):  # type: ignore[no-untyped-def]
 
 
 _PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (2, 0))
-
-
-@njit(**COMPILED)
-def add_weighted_fibre_moduli(p, element):  # type: ignore[no-untyped-def]
-    """Add the fibres' part to the moduli of `weighted_moduli`."""
-    for l in range(LANES):
-        element.factor_of_fibre[l] = p.weight[l] * p.scale[l]
-    _add_fibre_moduli(p, element, p.fibre)
-
-
-@njit(**COMPILED)
-def add_material_fibre_moduli(p, element):  # type: ignore[no-untyped-def]
-    """Add the fibres' part to the moduli of `elastic_moduli` of a POINT that is pulled back."""
-    for l in range(LANES):
-        element.factor_of_fibre[l] = 1.0
-    _add_fibre_moduli(p, element, p.material_fibre)
 
 
 @njit(forceinline=True, **COMPILED)

@@ -12,9 +12,9 @@ from .hyperelastic import NeoHookean as NeoHookean
 from .hyperelastic import Ogden as Ogden
 from .hyperelastic import OgdenPower as OgdenPower
 from .hyperelastic import OgdenQLV as OgdenQLV
+from .material import ORDER_IN_TIME as ORDER_IN_TIME
 from .material import LawTable as LawTable
 from .material import Material as Material
 from .material import PronyTerms as PronyTerms
 from .material import Uncoupled as Uncoupled
-from .viscoelastic import ORDER_IN_TIME as ORDER_IN_TIME
-from .viscoelastic import compute_prony_factors as compute_prony_factors
+from .material import compute_prony_factors as compute_prony_factors

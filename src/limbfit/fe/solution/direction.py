@@ -8,15 +8,12 @@ solution.
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ...arrays import Array
+from ...arrays import Array, Mask
 from ..contact.contact import Touch
 from ..system import Evaluation, System
-from .factor import Factor, LinearSolution
-from .springs import SpringChange
+from .factor import Factor, LinearSolution, SpringChange
 
-Bools = NDArray[np.bool_]
 SWEEPS, ROUNDS = 12, 4
 
 
@@ -49,7 +46,7 @@ def find_newton_direction(
     return direction.reshape(at.residual.shape)
 
 
-def _change(factor: Factor, at: Evaluation, touch: Touch, closed: Bools) -> SpringChange | None:
+def _change(factor: Factor, at: Evaluation, touch: Touch, closed: Mask) -> SpringChange | None:
     """How the springs of a set of closed points differ from the factor's; None where too many close or open.
 
     Where those of the present set already differ too much, there is a new factor.
@@ -61,7 +58,7 @@ def _change(factor: Factor, at: Evaluation, touch: Touch, closed: Bools) -> Spri
 
 
 def _match_springs(
-    factor: Factor, at: Evaluation, touch: Touch, closed: Bools, data: Array
+    factor: Factor, at: Evaluation, touch: Touch, closed: Mask, data: Array
 ) -> SpringChange | None:
     """`_change`; what does not last is made anew for ``data``, the tangent with those springs, instead."""
     if factor.lasting:
@@ -107,13 +104,13 @@ def _solve_for_descent(
     return LinearSolution(factor.apply(b), False, False)
 
 
-def _find_closed(touch: Touch, moved: Array) -> Bools:
+def _find_closed(touch: Touch, moved: Array) -> Mask:
     return touch.gaps + np.einsum("ci,ci->c", touch.normals, moved) < 0.0
 
 
 def _predict_closed(
-    system: System, at: Evaluation, touch: Touch, factor: Factor, b: Array, x: Array, closed: Bools
-) -> tuple[Array, Bools]:
+    system: System, at: Evaluation, touch: Touch, factor: Factor, b: Array, x: Array, closed: Mask
+) -> tuple[Array, Mask]:
     """Displacement (n, 1) and closed points by the factor's model, from ``x (n, 1)`` on."""
     springs = _change(factor, at, touch, closed)
     if springs is None:

@@ -2,8 +2,7 @@
 
 The factor is in single precision, half the price; the iteration runs in double.  Contact changes are few
 but stiff, and would spoil an old factor at once.  They are local springs, so the preconditioner takes them
-in exactly, by the Sherman-Morrison-Woodbury formula (`springs`); only the slow change of the tissue's own
-stiffness is left to the iteration.
+in exactly (`SpringColumns`); only the slow change of the tissue's own stiffness is left to the iteration.
 
 The tangent of an unstable state is made positive definite, so that Newton's direction is of descent.  The
 directions in which nearly incompressible tissue is unstable shear it: folds of a soft skin over a stiff
@@ -11,6 +10,8 @@ muscle. The stiffness added is therefore that of shear alone, a share of each ti
 is relative to the diagonal would be ruled by the bulk modulus, a hundred times larger, and stop what is
 stable, too.
 """
+
+from __future__ import annotations
 
 import time
 from collections import Counter, defaultdict
@@ -21,12 +22,12 @@ import numpy as np
 import scipy.sparse.linalg as spla
 from numpy.typing import NDArray
 
-from ...arrays import Array
+from ...arrays import Array, Index, Indices, Mask
 from ..bodies import GROUNDING_STIFFNESS
+from ..problem import Problem
 from ..system import System
 from .linear import (
     NONE,
-    Index,
     LinearSolver,
     NotPositiveDefiniteError,
     build_linear_solver,
@@ -34,8 +35,15 @@ from .linear import (
     prefers_multigrid,
 )
 from .multigrid import Multigrid
-from .springs import SpringChange, SpringColumns
 
+Single = NDArray[np.float32]
+# Smaller changes, relative to the stiffest spring, are left to the iteration.
+NOTABLE_CHANGE = 0.03
+# With more columns than this the dense solutions cost too much.
+MAX_COLUMNS = 500
+# Over the power 2/3 of all unknowns, as a cut across the body has: with more, the factor itself costs too
+# much.
+MAX_LAST = 1.5
 # A factor in single precision that needs more iterations at its own matrix has too few digits.
 MAX_REFINEMENTS = 12
 MAX_MINRES, MAX_RESTARTS = 100, 8
@@ -93,27 +101,15 @@ class Factor:
         started = time.perf_counter()
         system, threads = self._system, self._threads
         if self._choice == Multigrid.name:
-            self._solver: LinearSolver = Multigrid(system, threads)
+            self.solver: LinearSolver = Multigrid(system, threads)
         else:
-            self._solver = build_linear_solver(
+            self.solver = build_linear_solver(
                 system.indptr, system.indices, self._choice, threads, single, self._last
             )
         self._single = single
         self.columns = SpringColumns(self._system, self)
         self.counts["double_precision"] = int(not single)
         self.seconds["factor"] += time.perf_counter() - started
-
-    @property
-    def name(self) -> str:
-        return self._solver.name
-
-    @property
-    def transposed(self) -> bool:
-        return self._solver.transposed
-
-    @property
-    def last(self) -> Index:
-        return self._solver.last
 
     @property
     def shifted(self) -> bool:
@@ -123,12 +119,12 @@ class Factor:
     @property
     def lasting(self) -> bool:
         """True if what was factorised is worth keeping for other matrices."""
-        return self._solver.lasting
+        return self.solver.lasting
 
     @property
     def limit(self) -> int:
         """Products after which a new factorisation would have been cheaper."""
-        return int(self._solver.worth) if self.lasting else MAX_CYCLES
+        return int(self.solver.worth) if self.lasting else MAX_CYCLES
 
     def is_worn(self) -> bool:
         """True if another step with this factor costs more than the steps since it was made did on average.
@@ -136,7 +132,7 @@ class Factor:
         The optimal time to replace a machine whose running cost rises (Barlow and Proschan 1965).
         """
         steps = self._costs
-        return self.lasting and len(steps) > 1 and steps[-1] * len(steps) > self._solver.worth + sum(steps)
+        return self.lasting and len(steps) > 1 and steps[-1] * len(steps) > self.solver.worth + sum(steps)
 
     def start_step(self) -> None:
         """From here the cost counts for another step."""
@@ -179,7 +175,7 @@ class Factor:
             data = data.copy()
             data[self._ground[0]] += self._ground[1]
         try:
-            self._solver.factorise(data)
+            self.solver.factorise(data)
         except NotPositiveDefiniteError:
             return False
         return True
@@ -197,15 +193,15 @@ class Factor:
 
     def apply(self, b: Array) -> Array:
         """The factor's solution for ``b (n,)`` or ``(n, r)``."""
-        return self._timed(self._solver.solve, b, 1.0)
+        return self._timed(self.solver.solve, b, 1.0)
 
     def forward(self, b: Array, last: bool = False) -> Array:
-        """The first half of `apply`, as in `Halves`."""
-        return self._timed(lambda b: self._solver.forward(b, last), b, 0.0 if last else 0.5)
+        """The first half of `apply`, as in `LinearSolver`."""
+        return self._timed(lambda b: self.solver.forward(b, last), b, 0.0 if last else 0.5)
 
     def backward(self, y: Array, last: bool = False) -> Array:
-        """The second half of `apply`, as in `Halves`."""
-        return self._timed(lambda y: self._solver.backward(y, last), y, 0.0 if last else 0.5)
+        """The second half of `apply`, as in `LinearSolver`."""
+        return self._timed(lambda y: self.solver.backward(y, last), y, 0.0 if last else 0.5)
 
     def _timed(self, half: Callable[[Array], Array], b: Array, share: float) -> Array:
         """What a solver does to ``b``, which costs a ``share`` of a solution."""
@@ -225,14 +221,12 @@ class Factor:
         self.seconds["product"] += time.perf_counter() - started
         return y
 
-    def change_springs(
-        self, touched: NDArray[np.bool_], normals: Array, blocks: Array
-    ) -> SpringChange | None:
+    def change_springs(self, touched: Mask, normals: Array, blocks: Array) -> SpringChange | None:
         """What springs that differ from the factor's do to its solutions; None: they are too many.
 
         ``touched (c,)``: springs that will be pushed although they may not differ.
         """
-        return self.columns.change(touched, normals, blocks, int(6.0 * self._solver.worth))
+        return self.columns.change(touched, normals, blocks, int(6.0 * self.solver.worth))
 
     def solve(
         self, data: Array, b: Array, springs: SpringChange | None, tolerance: float,
@@ -344,11 +338,164 @@ def compute_shear_stiffness(system: System, moduli: Array) -> Array:
     return data
 
 
-def compute_body_stiffness(system: System, moduli: Array) -> tuple[NDArray[np.int32], Array]:
+def compute_body_stiffness(system: System, moduli: Array) -> tuple[Index, Array]:
     """Diagonal entries of the coordinates that are free to move rigid bodies, and what holds those of bodies
     that touch nothing (k,), N/mm."""
-    if not system.bodies.free:
-        return np.zeros(0, dtype=np.int32), np.zeros(0)
-    return system.indptr[-1 - system.bodies.free : -1], system.bodies.compute_grounding(
-        float(np.mean(moduli))
-    )
+    places = system.indptr[-1 - system.bodies.free : -1]
+    return places, system.bodies.compute_grounding(float(np.mean(moduli)))
+
+
+def find_touched_unknowns(system: System, problem: Problem) -> Index:
+    """Unknowns where bodies will touch, for the factor to eliminate last; none where they are too many."""
+    found = system.bodies.find_swept_unknowns([body.motion for body in problem.rigid_bodies])
+    return found if len(found) <= MAX_LAST * system.unknowns ** (2 / 3) else NONE
+
+
+class SpringColumns:
+    """Contact springs that changed since a factorisation, taken into its solutions exactly.
+
+    With ``F`` the factored matrix, ``N`` unit forces at the changed springs and ``D`` the change of their
+    stiffness, ``(F + N D N^T)^-1 = F^-1 - F^-1 N D (I + S D)^-1 N^T F^-1``, ``S = N^T F^-1 N`` (Sherman,
+    Morrison and Woodbury).  All that contact does to a solution thus happens in a small dense space.
+    With ``F^-1 = B A``, the halves of a solution, it happens between them: ``W = A N`` and ``P = B^T N`` give
+    ``S = P^T W`` and ``B (I - W D (I + S D)^-1 P^T) A``.  Of a Cholesky factor ``P`` is ``W``, and where the
+    indenter will touch is eliminated last, so that ``W`` is small and costs nothing.
+
+    The columns of ``W`` are made when first needed, and kept.
+    ``inner (c,)``: points whose columns cost nothing, since they stand on unknowns that are eliminated last.
+    ``rows``: unknowns beyond which ``W (rows, k)`` is zero.  ``at_points (c, 3, k)``: how the forces move the
+    points; 0 where that is not known for nothing.
+    """
+
+    def __init__(self, system: System, factor: Factor) -> None:
+        self._bodies, self._unknowns, self._factor = system.bodies, system.unknowns, factor
+        self.inner = system.bodies.find_points_on(factor.solver.last)
+        self._shares = system.bodies.select_shares(factor.solver.last)
+        self.clear(None)
+
+    def clear(self, blocks: Array | None) -> None:
+        """Forget the columns: there is a new factor, whose springs are ``blocks (c, 3, 3)``."""
+        self.blocks = blocks
+        self.keys: dict[tuple[int, int], int] = {}
+        self.rows: Index | slice = self._factor.solver.last if self.inner.any() else slice(None)
+        # In single precision like the factor: they only precondition.
+        rows = len(self._factor.solver.last) if self.inner.any() else self._unknowns
+        self.W: Single = np.empty((rows, 0), dtype=np.float32)
+        self.P = self.W
+        self.S = np.empty((0, 0))
+        count = 0 if blocks is None else len(blocks)
+        self.at_points = np.empty((count, 3, 0))
+
+    def change(self, touched: Mask, normals: Array, blocks: Array, most: int) -> SpringChange | None:
+        """The change to ``blocks``; None where it needs more than ``most`` columns.
+
+        ``touched (c,)``: springs to be pushed along ``normals (c, 3)`` although they may not differ.
+        """
+        if self.blocks is None:
+            return None
+        frames = self._bodies.frames  # on a flat face only the last axis is stiff
+        change = frames @ (blocks - self.blocks) @ frames.transpose(0, 2, 1)
+        typical = max(float(np.abs(blocks).max()), float(np.abs(self.blocks).max()), 1e-300)
+        wanted = np.abs(change).max(axis=2) > NOTABLE_CHANGE * typical
+        wanted |= touched[:, None] & (np.abs(np.einsum("cij,cj->ci", frames, normals)) > 0.2)
+        if not self._complete(wanted, most):
+            return None
+        return SpringChange(self, np.array(list(self.keys), dtype=int).reshape(-1, 2), frames, change,
+                            0.1 * NOTABLE_CHANGE * typical)  # fmt: skip
+
+    def displace_points(self, y: Array, closed: Mask) -> Array:
+        """Displacements (c, 3) of the contact points by the half solution ``y (n, 1)``.
+
+        Where only inner points are ``closed (c,)``, the others are taken to stay.
+        """
+        if not self.inner.any() or (closed & ~self.inner).any():
+            return self._bodies.move_springs(self._factor.backward(y))[..., 0]
+        x = self._factor.backward(y[self._factor.solver.last], True)
+        return np.where(self.inner[:, None], self._bodies.move_springs(x, self._shares)[..., 0], 0.0)
+
+    def add_to(self, y: Array, coefficients: Array) -> Array:
+        """Half solutions ``y (n, r)`` with the columns added, ``coefficients (k, r)`` times."""
+        y = y.copy()
+        y[self.rows] += self.W[:, : len(coefficients)] @ coefficients.astype(np.float32)
+        return y
+
+    def _complete(self, wanted: Mask, most: int) -> bool:
+        """Make the columns that are missing, unless they would be too many in all."""
+        new = [key for key in zip(*map(np.ndarray.tolist, np.nonzero(wanted))) if key not in self.keys]
+        costly = sum(not self.inner[point] for point, _ in (*self.keys, *new))
+        if costly > most or len(self.keys) + len(new) > max(most, MAX_COLUMNS):
+            return False
+        for inner in (True, False):
+            self._add([key for key in new if self.inner[key[0]] == inner], inner)
+        return True
+
+    def _add(self, new: list[tuple[int, int]], inner: bool) -> None:
+        if not new:
+            return
+        self.keys.update({key: len(self.keys) + i for i, key in enumerate(new)})
+        points, axes = np.array(new).T
+        unit = np.zeros((len(self.inner), 3, len(new)))
+        unit[points, :, np.arange(len(new))] = self._bodies.frames[points, axes]
+        shares = self._shares if inner else None
+        N = self._bodies.spread_forces(unit, shares)
+        W = self._factor.forward(N, inner)
+        at_points = self._bodies.move_springs(self._factor.backward(W, inner), shares)
+        if inner:
+            at_points[~self.inner] = 0.0
+        elif not isinstance(self.rows, slice):
+            self.W, self.rows = self._widen(self.W), slice(None)
+        narrow = inner and isinstance(self.rows, slice)
+        self.W = np.hstack([self.W, self._widen(W) if narrow else W.astype(np.float32)])
+        self.P = self.W if self._factor.solver.transposed else np.hstack([self.P, N.astype(np.float32)])
+        self.S = (self.P.T @ self.W).astype(float)
+        self.at_points = np.concatenate([self.at_points, at_points], axis=2)
+
+    def _widen(self, W: Array | Single) -> Single:
+        """Columns (m, k) of the unknowns that are eliminated last, as those of all (n, k)."""
+        out = np.zeros((self._unknowns, W.shape[1]), dtype=np.float32)
+        out[self._factor.solver.last] = W
+        return out
+
+
+class SpringChange:
+    """One set of changed springs: of all columns ``points (k,)`` and ``directions (k, 3)``; of those
+    ``stiffer (j,)`` whose stiffness changed, ``D (j, j)``.
+
+    ``keys (k, 2)``: point and axis of the columns; ``change (c, 3, 3)`` of stiffness in the points'
+    ``frames``, N/mm, of which less than ``little`` is none.
+    """
+
+    def __init__(
+        self, columns: SpringColumns, keys: Indices, frames: Array, change: Array, little: float
+    ) -> None:
+        self._columns, (self._points, axes) = columns, keys.T
+        self._directions = frames[self._points, axes]
+        self._stiffer = np.flatnonzero((np.abs(change[self._points]) > little).any(axis=(1, 2)))
+        points, axes = self._points[self._stiffer], axes[self._stiffer]
+        D = np.where(points[:, None] == points, change[points[:, None], axes[:, None], axes], 0.0)
+        S = columns.S[np.ix_(self._stiffer, self._stiffer)]
+        self._answer = D @ np.linalg.inv(np.eye(len(D)) + S @ D)
+
+    def project(self, values: Array) -> Array:
+        """Components (k, ...) along the springs of vectors (c, 3, ...) at the contact points."""
+        return np.einsum("ki,ki...->k...", self._directions, values[self._points])
+
+    def correct(self, y: Array) -> Array:
+        """First halves of solutions (n, r) of the changed matrix from those ``y (n, r)`` of the factor."""
+        if not len(self._stiffer):
+            return y
+        moved = (self._columns.P.T @ y[self._columns.rows].astype(np.float32))[self._stiffer]
+        coefficients = np.zeros((len(self._points), y.shape[1]))
+        coefficients[self._stiffer] = -(self._answer @ moved)
+        return self._columns.add_to(y, coefficients)
+
+    def coefficients(self, moved: Array, forces: Array) -> Array:
+        """What to add (k,) of each column, for displacements of the factor's solution and forces (c, 3)."""
+        out = self.project(forces)
+        at = self._stiffer
+        out[at] -= self._answer @ (self.project(moved) + self._columns.S @ out)[at]
+        return out
+
+    def at_points(self, coefficients: Array) -> Array:
+        """The combination of columns at the contact points (c, 3)."""
+        return self._columns.at_points @ coefficients

@@ -13,20 +13,18 @@ import os
 import weakref
 from abc import ABC, abstractmethod
 from itertools import pairwise
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar
 
 import numpy as np
 import scipy.sparse as sp
 import scipy.sparse.linalg as spla
 from numba import njit
 from numpy.typing import NDArray
+from threadpoolctl import threadpool_info
 
-from ...arrays import Array
+from ...arrays import Array, Index, Indices
 from ...errors import ProblemError
-from ..threads import get_thread_pool, silence_openmp
-
-Index = NDArray[np.int32]
-
+from ..system import get_thread_pool
 
 # An environment variable: with any value, PARDISO counts as not installed.
 WITHOUT_PARDISO = "LIMBFIT_WITHOUT_PARDISO"
@@ -85,20 +83,6 @@ class LinearSolver(ABC):
         return y
 
 
-class Halves(Protocol):
-    """What makes solutions in two halves: see `LinearSolver`."""
-
-    @property
-    def transposed(self) -> bool: ...
-
-    @property
-    def last(self) -> Index: ...
-
-    def forward(self, b: Array, last: bool = False) -> Array: ...
-
-    def backward(self, y: Array, last: bool = False) -> Array: ...
-
-
 class Pardiso(LinearSolver):
     """Cholesky by Intel MKL's PARDISO, in double or single precision.
 
@@ -135,7 +119,7 @@ class Pardiso(LinearSolver):
         # The factor lives outside Python's memory.
         self._release = weakref.finalize(self, _release, self._mkl, self._handle, self._parameters, self._n)
         self._call(11, np.zeros(1), np.zeros(1), 1)
-        silence_openmp()  # loaded by the first call
+        _silence_openmp()  # loaded by the first call
         self._parameters[PARTIAL] = 0
         self.worth = max((float(self._parameters[17]) / self._n.value) ** (4 / 3) / ROW_PER_SOLUTION, 2.0)
 
@@ -187,6 +171,13 @@ class Pardiso(LinearSolver):
             raise MemoryError(f"PARDISO failed with code {code}")
 
 
+def _silence_openmp() -> None:
+    """Let Intel's OpenMP threads sleep at once between factorisations instead of spinning for 0.2 s."""
+    for library in threadpool_info():
+        if library["prefix"] == "libiomp":
+            ctypes.CDLL(library["filepath"]).kmp_set_blocktime(0)
+
+
 @functools.cache
 def _load_mkl() -> Any:
     """MKL's library: from the installed package, or as pypardiso finds it by searching the disk."""
@@ -222,7 +213,7 @@ def _call_pardiso(
     return error.value
 
 
-def _release(mkl: Any, handle: NDArray[np.int64], parameters: Index, n: ctypes.c_int32) -> None:
+def _release(mkl: Any, handle: Indices, parameters: Index, n: ctypes.c_int32) -> None:
     empty, none = np.zeros(1), np.zeros(1, dtype=np.int32)
     _call_pardiso(mkl, handle, parameters, n, -1, 1, empty, none, none, none, empty, empty)
 

@@ -13,11 +13,11 @@ import scipy.sparse as sp
 from numba import njit
 from numpy.typing import NDArray
 
-from ...arrays import Array
+from ...arrays import Array, Index, Indices, Mask
 from ...mesh import TET10_EDGES
 from ..pattern import build_node_graph, build_upper_pattern, place_of
 from ..system import System
-from .linear import Index, LinearSolver, NotPositiveDefiniteError, build_linear_solver
+from .linear import LinearSolver, NotPositiveDefiniteError, build_linear_solver
 
 # A block is added to the upper triangle turned where its parents are in reverse, both ways on the diagonal.
 _TURNED, _BOTH = 1, 2
@@ -95,7 +95,7 @@ class Multigrid(LinearSolver):
         return x.ravel()[self._slots].astype(np.float64)
 
 
-def _number_nodes(moving: NDArray[np.bool_]) -> tuple[Index, NDArray[np.int64]]:
+def _number_nodes(moving: Mask) -> tuple[Index, Indices]:
     """Number of each node that can move in any component (else -1); places of the unknowns, 3 to a node."""
     active = moving.any(axis=1)
     number = np.where(active, np.cumsum(active) - 1, -1).astype(np.int32)
@@ -103,8 +103,8 @@ def _number_nodes(moving: NDArray[np.bool_]) -> tuple[Index, NDArray[np.int64]]:
 
 
 def _group_into_blocks(
-    indptr: Index, indices: Index, slots: NDArray[np.int64], nodes: int
-) -> tuple[tuple[Index, Index], NDArray[np.int64]]:
+    indptr: Index, indices: Index, slots: Indices, nodes: int
+) -> tuple[tuple[Index, Index], Indices]:
     """Rows and columns of the blocks, and the place in them of every entry of the matrix by unknowns."""
     rows, count = np.repeat(slots, np.diff(indptr)), len(indices)
     numbered = sp.csr_matrix((np.arange(1, count + 1), (rows, slots[indices])), shape=(3 * nodes,) * 2)
@@ -116,7 +116,7 @@ def _group_into_blocks(
     return (blocks.indptr.astype(np.int32), blocks.indices.astype(np.int32)), places
 
 
-def _find_ends(cells: NDArray, nodes: int) -> NDArray[np.int64]:
+def _find_ends(cells: NDArray, nodes: int) -> Indices:
     """The two corners (n, 2) between which each node lies: a corner between itself and itself."""
     ends = np.stack([np.arange(nodes)] * 2, axis=1)
     ends[cells[:, 4:].ravel()] = cells[:, TET10_EDGES].reshape(-1, 2)

@@ -19,15 +19,7 @@ from numba import njit
 from ...arrays import Array
 from ..bodies import Bodies
 from ..kernel.laws import Laws
-from ..kernel.response import (
-    add_material_fibre_moduli,
-    add_material_fibre_stress,
-    elastic_moduli,
-    elastic_response,
-    pressures,
-    pull_back,
-    stress_rates,
-)
+from ..kernel.response import elastic_moduli, elastic_response, pressures, pull_back, stress_rates
 from ..lanes import LANES, workspace
 from ..materials import compute_prony_factors
 from ..memory import Memory
@@ -240,12 +232,9 @@ def explicit_derivatives(  # type: ignore[no-untyped-def]
         elastic_response(elements, start, tables, u, points, law[0], numbers)
         pressures(weights, regions, tables, mean, start, points, element[0])
         for q in range(len(points)):
-            pull_back(points[q])
+            pull_back(points[q], len(fibres) > 0)
             stress_rates(points[q], law[0], numbers, rates[q * n : (q + 1) * n])
-            elastic_moduli(points[q], element[0])
-            if len(fibres):
-                add_material_fibre_stress(points[q])
-                add_material_fibre_moduli(points[q], element[0])
+            elastic_moduli(points[q], element[0], len(fibres) > 0)
         for el in range(start, min(start + LANES, m)):
             l, region = el - start, regions[el]
             fe[:] = 0.0

@@ -3,9 +3,12 @@
 import time
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
+from threadpoolctl import ThreadpoolController
 
 from ...arrays import Array
 from ...errors import ProblemError
@@ -16,15 +19,13 @@ from ..motion import Drives
 from ..problem import Problem
 from ..result import Result, State, Step
 from ..system import Evaluation, Increment, System
-from ..threads import limit_numpy_threads
 from .control import PATIENCE, StepControl, StepController, predict_remaining_times, schedule_steps
 from .coupling import Coupling, couple, renew_increment, solve_coupled
 from .direction import refactor_at
-from .factor import Factor
+from .factor import Factor, find_touched_unknowns
 from .linear import prefers_multigrid
 from .newton import FIRST_DAMPING, Equilibrium, NewtonControl, compute_reaction_scale, equilibrate
 from .sensitivity import Explicit, ForceTakeover, MemoryDerivative
-from .springs import find_touched_unknowns
 from .start import IndenterStart, WarmStart, build_grips, compute_extrapolation, measure_indenter_travel
 
 # Penetration over the allowed one that a few more iterations will not mend; how often a penalty is raised.
@@ -125,7 +126,7 @@ class SteppedRun:
                 return
             t = pace.next_time(now, targets[0])
             before = self.counts["newton_iterations"]
-            with limit_numpy_threads():
+            with _limit_numpy_threads():
                 found = self._attempt(t, pace.patience)
             if isinstance(found, str):
                 self.counts["cuts"] += 1
@@ -170,7 +171,7 @@ class SteppedRun:
             self.floor = max(self.floor, 1e-2 * float(np.linalg.norm(strained)))  # no stress may be left
         elif not self.problem.acts_at_once:
             return True
-        with limit_numpy_threads():
+        with _limit_numpy_threads():
             found = self._attempt(0.0, self.pace.usual * PATIENCE, takes)
         if isinstance(found, str):
             self.reason = f"the {what} found no equilibrium: {found}"
@@ -412,6 +413,20 @@ class SteppedRun:
         if self.problem.history.forced:  # the force is what is stated
             return du, np.zeros(laws.count)
         return du, at.force * d_penalty + d_reaction + d_force
+
+
+def _limit_numpy_threads() -> AbstractContextManager[object]:
+    """While this lasts, NumPy's own linear algebra runs on one thread.
+
+    Its arrays are small here, and its idle threads would spin on the cores that the solver works on.
+    """
+    return _find_openblas().limit(limits=1)
+
+
+@cache
+def _find_openblas() -> ThreadpoolController:
+    """OpenBLAS alone: a limit on all libraries, once lifted, would leave MKL with one thread."""
+    return ThreadpoolController().select(internal_api="openblas")
 
 
 def _check_takeovers(problem: Problem, planned: Array) -> None:

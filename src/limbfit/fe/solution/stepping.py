@@ -17,17 +17,19 @@ from numpy.typing import NDArray
 
 from ...arrays import Array
 from ...errors import ProblemError
-from ..diagnostics import (
+from ..observables import compute_element_fields
+from ..problem import Problem
+from ..result import (
+    Result,
     SimulationWarning,
+    State,
+    Step,
     find_inexact_sensitivities,
     find_inexact_steps,
     find_inverted_elements,
     find_penetration,
     find_slip,
 )
-from ..observables import compute_element_fields
-from ..problem import Problem
-from ..result import Result, State, Step
 from ..system import System
 from .control import StepControl
 from .simulation import SteppedRun
@@ -254,7 +256,7 @@ def _collect_statistics(run: SteppedRun, seconds: float, sunk_steps: int) -> dic
         "factorisations": sum(factor.counts["factorisations"] for factor in used),
         "solves": sum(factor.counts["half_solves"] for factor in used) // 2,
         "double_precision": any(factor.counts["double_precision"] for factor in used),
-        "linear_solver": run.factor.name,
+        "linear_solver": run.factor.solver.name,
         "element": run.system.element.name,
         "unknowns": run.system.unknowns,
         "seconds": {**parts, "total": seconds},

@@ -25,9 +25,9 @@ from ...laws import Parameters
 from ...mesh import write_vtu
 from ...results.socket import SocketDesignResult, SocketSimulation, SocketState
 from ...socket import Recipe, Socket, rectify_limb
+from ...socket.pressing import Target, build_zone
 from ...socket.rays import compute_offsets, compute_profile
 from ...socket.rectify import reduce_to_volume
-from ...socket.targets import Target, build_zone
 from ...socket.wall import measure_thickness
 from ...study import Study
 from ..engine.context import NO_PARAMETERS, Context

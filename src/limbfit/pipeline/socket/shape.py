@@ -13,8 +13,8 @@ from ...arrays import Array
 from ...errors import StudyError, SurfaceError
 from ...laws import FIBRED
 from ...socket import Area, Recipe, Socket, read_socket, rectify_limb
-from ...socket.clearance import refuse_bones
 from ...socket.landmarks import (
+    STANDARD_LOADS,
     SkinRegion,
     build_default_regions,
     build_stated_region,
@@ -22,9 +22,9 @@ from ...socket.landmarks import (
     find_load_point,
     find_top,
 )
-from ...socket.loads import STANDARD_LOADS
-from ...socket.targets import Target
-from ...socket.trim import Trim
+from ...socket.pressing import Target
+from ...socket.rectify import Trim
+from ...socket.shape import refuse_bones
 from ...socket.wall import build_wall
 from ...study import Study
 from ...study.socket import SocketLoadTable
