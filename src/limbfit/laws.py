@@ -210,10 +210,7 @@ def has_fibres(name: str) -> bool:
 def register_law(law: TissueLaw) -> None:
     """Make a law known by its name, in the file that a study names in ``study.extensions``.
 
-    Raises
-    ------
-    InputError
-        Where the name is taken, or a start is not within its bounds.
+    Raises `InputError` where the name is taken, or a start is not within its bounds.
     """
     if not law.moduli:
         raise InputError("has no modulus", place=law.name, remedy='give a parameter the unit "kPa"')

@@ -179,6 +179,8 @@ def build_pressed_problem(
 ) -> Problem:
     """A limb whose outer surface bears a pressure that follows it; bones and proximal cut are held.
 
+    Raises `ProblemError` where no face bears any.
+
     Parameters
     ----------
     mesh : LPS mm, with the face set ``skin`` and node sets ``fixed_*``.
@@ -186,11 +188,6 @@ def build_pressed_problem(
     pressure_kPa : (f,) of the faces of that set, 0 or more; rounded to `PRESSURE_LEVELS`
         parts of the largest.
     on_s, hold_s : how long the pressure comes on and then stays.
-
-    Raises
-    ------
-    ProblemError
-        Where no face bears any.
     """
     top = float(pressure_kPa.max())
     if not top > 0.0:

@@ -258,15 +258,12 @@ def measure_moving_time(times: Array, values: Array, t: float) -> float:
 class Activation:
     """The share of full activation over time, piecewise linear; the last one holds on.
 
+    Raises `ProblemError` where times do not grow from 0, or a share is negative or not finite.
+
     Parameters
     ----------
     times : (n,) s, from 0.
     shares : (n,) of the active stress of every `Contractile` tissue; 0 at rest, not negative.
-
-    Raises
-    ------
-    ProblemError
-        Where times do not grow from 0, or a share is negative or not finite.
     """
 
     times: Sequence[float] | Array

@@ -39,14 +39,12 @@ def to_problem(model: FebModel, indenter: Indenter | None = None, **settings: An
     the faces stand for its shape, which is put where the body's foremost point is. Regions have the names of
     the parts.
 
+    Raises `ProblemError` if the input has no deformable part, several element types, or motions that are not
+    one history.
+
     Parameters
     ----------
     settings : further fields of `Problem` (``element``, ``contact_rule``, ..).
-
-    Raises
-    ------
-    ProblemError
-        If the input has no deformable part, several element types, or motions that are not one history.
     """
     tissue, driven = build_tissue(model), find_drive(model, shaped=indenter is not None)
     touching, name = group_contacts(model), driven.indenter

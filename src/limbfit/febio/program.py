@@ -67,15 +67,12 @@ def run_febio(
 ) -> FebioRun:
     """Run FEBio on ``model.feb`` in ``folder``; what an earlier run left there is removed first.
 
+    Raises `RunError` if the program cannot be started, or the folder cannot be written.
+
     Parameters
     ----------
     end_s : the time that the input asks for, s.
     table : name of the log-file table that holds the indenter's force.
-
-    Raises
-    ------
-    RunError
-        If the program cannot be started, or the folder cannot be written.
     """
     output = folder / OUTPUT
     try:

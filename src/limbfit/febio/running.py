@@ -42,18 +42,14 @@ def run_feb(
 ) -> FebRun:
     """Solve a FEBio input and write its log-file tables into the folder ``output``.
 
+    Raises `ProblemError` if the input cannot be read or holds what limbfit does not support, with its line,
+    and `RunError` if the tables cannot be written.
+
     Parameters
     ----------
     on_step : called with every accepted step and the time of the last one, s.
     keep : refuse to write over existing files.
     settings : fields of `StepControl` that replace what the input says (``times``, ``threads``, ..).
-
-    Raises
-    ------
-    ProblemError
-        If the input cannot be read or holds what limbfit does not support; with its line.
-    RunError
-        If the tables cannot be written.
     """
     folder = Path(output)
     with add_location(file=path):

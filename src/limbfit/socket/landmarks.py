@@ -54,15 +54,12 @@ class Directions:
 def find_directions(anatomy: Anatomy, side: Literal["left", "right"] | None = None) -> Directions:
     """Find a limb's directions: proximal by its cut, anterior by patient space, lateral by fibula or side.
 
+    Raises `SurfaceError` for a limb that lies along the anterior axis of patient space, or whose fibula lies
+    on the other side than ``side`` has it.
+
     Parameters
     ----------
     side : of the patient; by default lateral is where the fibula lies beside the tibia.
-
-    Raises
-    ------
-    SurfaceError
-        For a limb that lies along the anterior axis of patient space, or whose fibula lies on the other side
-        than ``side`` has it.
     """
     proximal = anatomy.cut_normal
     anterior = np.array([0.0, -1.0, 0.0])

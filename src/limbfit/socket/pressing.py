@@ -30,16 +30,13 @@ TISSUE_DEPTH = "tissue depth"
 class Area:
     """A round area of the face that presses in (positive depth) or gives relief.
 
+    Raises `SurfaceError` where its sides would be steeper than 45 degrees.
+
     Attributes
     ----------
     points : its middle (3,), LPS mm, on the limb or near it; kept as (1, 3).
     radius_mm : how far from there its depth has faded to nothing.
     depth_mm : there, along the limb's normal.
-
-    Raises
-    ------
-    SurfaceError
-        Where its sides would be steeper than 45 degrees.
     """
 
     kind: ClassVar[str] = "area"
@@ -143,15 +140,13 @@ class Target:
     def at(self, points: Array, anatomy: Anatomy, regions: Mapping[str, SkinRegion], socket: Socket) -> Array:
         """Pressure (n,) kPa at points (n, 3) of the limb's outer surface, LPS mm; 0 beyond the brim.
 
+        Raises `SurfaceError` for a region that the limb does not have, and tissue depth of a limb without
+        bones.
+
         Parameters
         ----------
         regions : of the limb; those of a preset that it does not have count as the rest.
         socket : any face around the limb, for where the brim runs.
-
-        Raises
-        ------
-        SurfaceError
-            For a region that the limb does not have, and tissue depth of a limb without bones.
         """
         skin = anatomy.skin
         below = skin.find_nearest(points)[2]  # a liner

@@ -41,18 +41,15 @@ def read_socket(
     Of a socket with a wall the inner face is taken, if it can be recognised. A face whose triangles look away
     from the tissue is turned. `Socket.notes` says so.
 
+    Raises `SurfaceError` for a file that is no surface, is in another unit, has holes or no opening, opens
+    distally, does not go around the limb, cuts into a bone or crosses itself: each with the remedy.
+
     Parameters
     ----------
     unit, space : of the file; by default mm and what it says itself, else LPS.
     outer : the limb's closed outer surface (skin, or liner on skin), LPS mm, flat at its proximal cut.
     frame : of the limb.
     bones : closed surfaces, LPS mm, that the socket must leave inside.
-
-    Raises
-    ------
-    SurfaceError
-        For a file that is no surface, is in another unit, has holes or no opening, opens distally, does not
-        go around the limb, cuts into a bone or crosses itself: each with the remedy.
     """
     surface = read_surface(file, space, unit, key="socket.space")
     with add_location(file=file):

@@ -206,17 +206,14 @@ class SocketSurface:
 def rectify_limb(outer: Surface, frame: Frame, recipe: Recipe) -> Socket:
     """Make the inner face of a socket for a limb.
 
+    Raises `SurfaceError` where the limb is folded or its end is no end, the brim leaves the limb, an area
+    misses it, or the face would fold: each with the remedy.
+
     Parameters
     ----------
     outer : the limb's closed outer surface (skin, or liner on skin), LPS mm, flat at its proximal cut.
     frame : of the limb, whose z axis points proximally from the cut.
     recipe : what is done to the shape.
-
-    Raises
-    ------
-    SurfaceError
-        Where the limb is folded or its end is no end, the brim leaves the limb, an area misses it, or the
-        face would fold: each with the remedy.
     """
     limb = compute_profile(outer, frame)
     lines = trim_limb(limb, frame, recipe.trim)

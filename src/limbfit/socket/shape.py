@@ -113,17 +113,14 @@ def refuse_bones(
 ) -> None:
     """Refuse a face that a bone reaches through, below the brim and above an open end.
 
+    Raises `SurfaceError` with the bone, how far it reaches through, and the remedy.
+
     Parameters
     ----------
     face, brim : of a `Socket`, LPS mm.
     frame : of the limb.
     bones : closed surfaces, LPS mm.
     spare_mm : how far a bone may do so besides roughness: a liner that the face was drawn without.
-
-    Raises
-    ------
-    SurfaceError
-        With the bone, how far it reaches through, and the remedy.
     """
     face = Surface(frame.to_limb(face.points), face.faces)
     closed = close_by_fans(face.flipped)

@@ -31,18 +31,15 @@ def build_wall(
 
     Its inner side is the socket's face; the outer side lies ``thickness_mm`` outside it along its normals.
 
+    Raises `SurfaceError` for a socket whose distal end is open, a wall that would be thinner than 90 % of
+    what was asked or cross itself, and an adapter that is as wide as the socket.
+
     Parameters
     ----------
     axis : (3,) proximal direction; the adapter's face looks the other way.
     thickness_mm : of the wall.
     adapter_diameter_mm : of the cylinder at the distal end; 0: none.
     adapter_mm : its material between the lowest point of the cavity and its flat face, mm.
-
-    Raises
-    ------
-    SurfaceError
-        For a socket whose distal end is open, a wall that would be thinner than 90 % of what was asked or
-        cross itself, and an adapter that is as wide as the socket.
     """
     if socket.open_distal:
         raise SurfaceError("a socket with an open distal end has no wall", remedy="close its end")

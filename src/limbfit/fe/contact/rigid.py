@@ -118,6 +118,9 @@ class RigidShape(ABC):
 class Indenter(RigidShape):
     """A rigid indenter that moves along ``axis``.
 
+    Raises `ProblemError` for a size, a place or a direction that is impossible, and `InputError` for a shape
+    that nobody registered.
+
     Parameters
     ----------
     shape : ``square`` (prism), ``sphere``, ``cylinder`` (flat end), ``stl`` (the ``surface``) or the name of
@@ -131,13 +134,6 @@ class Indenter(RigidShape):
     surface : triangles in the indenter's frame, for ``stl`` only.
     sharp : the rounding over the width that stands for a sharp edge, where 1 % is too coarse for the tissue.
     measures : further numbers of a shape that has them, by their keys.
-
-    Raises
-    ------
-    ProblemError
-        For a size, a place or a direction that is impossible.
-    InputError
-        For a shape that nobody registered.
     """
 
     shape: str = "square"
@@ -250,15 +246,12 @@ def check_open_surface(points: Array, faces: NDArray, name: str) -> tuple[Array,
 class OpenSurface(Wall):
     """An open surface as a rigid body; see the module docstring, and `Wall`.
 
+    Raises `ProblemError` where it is no triangle surface, or its triangles do not agree on a side.
+
     Parameters
     ----------
     points, faces, centre, axis, edge : as in `Wall`.
     reach : distance from which the surface is not felt, mm.
-
-    Raises
-    ------
-    ProblemError
-        Where it is no triangle surface, or its triangles do not agree on a side.
     """
 
     reach: float = 20.0

@@ -71,6 +71,9 @@ class SmoothSurface(Wall):
     ) -> SmoothSurface:  # fmt: skip
         """The surface of triangles.
 
+        Raises `ProblemError` where it is no triangle surface, its triangles do not agree on a side, or the
+        shapes do not match.
+
         Parameters
         ----------
         points : (n, 3) mm, in the body's frame.
@@ -80,11 +83,6 @@ class SmoothSurface(Wall):
             ``a`` (rad) at most ``spacing a / 8``.
         reach : distance from which the surface is not felt, mm; added to it is what it grows by.
         fade : how far past the brim the wall ends, mm; two spacings where not given.
-
-        Raises
-        ------
-        ProblemError
-            Where it is no triangle surface, its triangles do not agree on a side, or the shapes do not match.
         """
         final, triangles = check_open_surface(points, faces, "the smooth surface")
         if not (spacing > 0.0 and reach > 0.0):

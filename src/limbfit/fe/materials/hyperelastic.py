@@ -218,6 +218,8 @@ class OgdenPower(SymmetricOgden):
 class Ogden(OgdenSum):
     """Ogden's law: ``W = sum_k c_k/m_k^2 (lt_1^m_k + lt_2^m_k + lt_3^m_k - 3) + U(J)``.
 
+    Raises `ProblemError` where no material has such parameters.
+
     Parameters
     ----------
     terms : one to six (c_k, m_k): modulus in MPa, exponent.  Single moduli may be negative, their sum, twice
@@ -225,11 +227,6 @@ class Ogden(OgdenSum):
     prony : (g_l, tau_l): amplitude, relaxation time in s; any number.
     kappa_ratio : bulk modulus over the long-term shear modulus ``sum c_k / 2``.
     volumetric : name in `VOLUMETRIC_LAWS`.
-
-    Raises
-    ------
-    ProblemError
-        Where no material has such parameters.
     """
 
     terms: PronyTerms

@@ -45,10 +45,7 @@ def iterate(
 ) -> Iterator[Step]:
     """Accepted steps of a simulation, one by one; ends early where no step converges.
 
-    Raises
-    ------
-    ProblemError
-        Before anything is solved, where the problem is impossible as stated.
+    Raises `ProblemError` before anything is solved, where the problem is impossible as stated.
     """
     yield from SteppedRun(problem, steps, sensitivities).run()
 
@@ -66,6 +63,9 @@ def solve(
 ) -> Result:
     """Simulate an indentation.
 
+    Raises `ProblemError` before anything is solved, where the problem is impossible as stated. A simulation
+    that cannot go on is no error: the result says ``completed = False`` and why.
+
     Parameters
     ----------
     sensitivities : also the derivative of the force with respect to every material parameter.
@@ -78,12 +78,6 @@ def solve(
         stated times.
     begin : of an earlier call with the same problem, steps, sensitivities and checkpoints, whose result this
         one then has: with one thread, to the last bit.
-
-    Raises
-    ------
-    ProblemError
-        Before anything is solved, where the problem is impossible as stated.  A simulation that cannot go
-        on is no error: the result says ``completed = False`` and why.
     """
     if (checkpoints or begin) and (problem.indenter is not None or steps.times is None):
         raise ProblemError("only a simulation without an indenter and with stated times can be resumed")
