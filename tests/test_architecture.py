@@ -14,7 +14,7 @@ PACKAGE = Path(limbfit.__file__).parent
 FLOORS = [
     {"__main__"},
     {"cli"},
-    {"studio"},
+    {"studio", "population"},
     {"pipeline"},
     {"bench"},
     {"report", "phantom"},

@@ -93,6 +93,19 @@ from .pipeline.commands.simulate import (
     simulate_feb as simulate_feb,
     simulate_site as simulate_site,
 )
+from .population.shape_model import (
+    ShapeModel as ShapeModel,
+    build_shape_model as build_shape_model,
+)
+from .population.trials import (
+    check_trial as check_trial,
+    count_people as count_people,
+    make_robust as make_robust,
+    open_person as open_person,
+    report_population as report_population,
+    run_population as run_population,
+    write_trial as write_trial,
+)
 from .results.reference import build_schema as build_schema
 from .results.study_results import (
     StudyResults as StudyResults,
@@ -104,7 +117,5 @@ from .shapes import (
     register_shape as register_shape,
 )
 from .studio.server import serve_studio as serve_studio
-from .study import (
-    Study as Study,
-    load_study as load_study,
-)
+from .study.loading import load_study as load_study
+from .study.study import Study as Study

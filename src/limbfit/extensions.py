@@ -7,9 +7,10 @@ digest counts wherever it can change an answer.
 import sys
 from collections.abc import Iterable, Iterator, Mapping
 from hashlib import sha256
+from importlib import import_module
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 from .errors import InputError
 
@@ -99,3 +100,19 @@ def _run(file: Path, name: str) -> None:
         raise InputError(f"{type(error).__name__}: {error}", file=file, place="extension") from error
     finally:
         _running.pop()
+
+
+def import_extra(module: str, extra: str, what: str) -> Any:
+    """Import a library that an extra of limbfit installs.
+
+    Raises
+    ------
+    InputError
+        Where it is not installed; ``what`` needs it.
+    """
+    try:
+        return import_module(module)
+    except ImportError:
+        library = module.partition(".")[0]
+        remedy = f"pip install 'limbfit[{extra}]'"
+        raise InputError(f"{what} needs {library}, which is not installed", remedy=remedy) from None

@@ -15,14 +15,14 @@ from typer.core import TyperGroup
 from .._version import __version__
 from ..errors import InputError, LimbfitError
 from ..execution import SAFE_PATH
-from . import acquire, bench, commands, experiments, febio, runs, socket
+from . import acquire, bench, commands, experiments, febio, population, runs, socket
 from .console import INTERRUPTED, fail, print_line, prompt_interrupt
 
 GROUPS: Mapping[str, tuple[str, ...]] = {
     "Patient": ("demo", "phantom", "series", "check", "segment", "surfaces", "sites", "mesh"),
     "Identify": ("run", "status", "report", "simulate", "batch", "reproduce"),
     "Trust": ("uncertainty", "crossvalidate", "regions", "sensitivity", "cube", "experiment"),
-    "Socket": ("socket",),
+    "Socket": ("socket", "population", "shapes"),
     "Experiment": ("design", "acquire", "recording", "virtual-fitsocket"),
     "Exchange": ("export", "febio", "compare", "schema"),
     "Machine": ("studio", "doctor", "bench"),
@@ -62,6 +62,8 @@ _WITH_JOBS = {commands.run, commands.demo, *experiments.VERBS}
 for verb in (*commands.VERBS, *experiments.VERBS, *febio.VERBS, *runs.VERBS, *acquire.VERBS):
     app.command()(runs.add_execution_options(verb) if verb in _WITH_JOBS else verb)
 app.add_typer(socket.app, name="socket")
+app.add_typer(population.app, name="population")
+app.add_typer(population.shapes, name="shapes")
 app.add_typer(bench.app, name="bench")
 
 

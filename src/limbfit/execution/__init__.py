@@ -23,6 +23,7 @@ from .processes import (
     ProcessExecutor,
     SerialExecutor,
     count_usable_cores,
+    limit_cores,
     report_progress,
     run_in_background,
     set_in_block,

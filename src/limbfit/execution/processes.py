@@ -51,6 +51,7 @@ class Limits:
 
 NO_LIMITS = Limits()
 
+_cores: ContextVar[int | None] = ContextVar("_cores", default=None)
 _listener: ContextVar[Callable[[Any], None] | None] = ContextVar("_listener", default=None)
 
 
@@ -144,10 +145,14 @@ class Executor(ABC):
 
 
 def count_usable_cores() -> int:
-    """Return the number of cores that this process may use; a batch system can allow fewer than there are."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
+    """Return how many cores this process may use; a batch system, or `limit_cores`, can allow fewer."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return min(cores, _cores.get() or cores)
+
+
+def limit_cores(count: int) -> AbstractContextManager[None]:
+    """Let what this block runs use no more cores, since others like it run beside it."""
+    return set_in_block(_cores, count)
 
 
 class SerialExecutor(Executor):

@@ -35,9 +35,14 @@ def build_report(results: Path, out: Path) -> Path:
     readable.
     """
     store, out = load_store(Path(results)), Path(out)
-    page = make_page(store)
-    _write_parts(page, out)
+    file = write_page(make_page(store), out)
     (out / METHODS_NAME).write_text(write_method_markdown(store), encoding="utf-8")
+    return file
+
+
+def write_page(page: Page, out: Path) -> Path:
+    """Write a page as one HTML file into the folder ``out``, with its tables and drawings beside it."""
+    _write_parts(page, out)
     file = out / REPORT_NAME
     draft = file.with_suffix(".part")
     draft.write_text(_render(page), encoding="utf-8")

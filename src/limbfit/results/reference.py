@@ -7,7 +7,8 @@ from typing import Any, Union, get_args, get_origin
 
 from ..errors import InputError
 from .base import ResultPart
-from .study_results import MODELS
+from .population import PopulationResult
+from .study_results import MODELS as OF_STUDIES
 
 HEAD = """# Results
 
@@ -16,6 +17,7 @@ In Python it is an attribute of [`load_results(study)`](python.md#stored-results
 `limbfit schema RESULT` prints its JSON schema. Numbers are in the unit of their row. Curves and tables
 are CSV files beside these.
 """
+MODELS = OF_STUDIES | {"population": PopulationResult}
 _UNITS = ("mm", "mm2", "mm3", "cm3", "N", "Nmm", "kPa", "s", "m_s", "mm_s", "deg", "percent", "GB")
 _UNIT_WORDS = {"mm2": "mm²", "mm3": "mm³", "cm3": "cm³", "Nmm": "N mm", "m_s": "m/s", "mm_s": "mm/s"}
 _WORDS: Mapping[Any, str] = {

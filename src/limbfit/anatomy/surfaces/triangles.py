@@ -319,6 +319,7 @@ def read_surface(
     unit: str = "mm",
     *,
     key: str = "surfaces.coordinates",
+    merge: bool = True,
 ) -> Surface:
     """A surface from .stl, .ply, .vtp or .obj, in LPS mm; coincident points are merged.
 
@@ -330,13 +331,14 @@ def read_surface(
     coordinates : what the file holds; by default what it says itself, as those of 3D Slicer do, else LPS.
     unit : of the file: mm, cm, m or inch.
     key : of the study that says the coordinates, for the error's text.
+    merge : False keeps points and triangles as the file has them.
     """
     path = Path(path)
     with add_location(file=path):
         if not path.is_file():
             raise SurfaceError("no such surface")
         _check_suffix(path)
-        poly = _read_poly(path)
+        poly = _read_poly(path, merge)
         surface = from_pyvista(poly.triangulate())
         if not np.all(np.isfinite(surface.points)):
             raise SurfaceError("points that are not numbers", remedy="export the surface again")
@@ -347,7 +349,9 @@ def read_surface(
                 remedy=f"correct {key}, or export the surface again",
             )
         sign = np.array([-1.0, -1.0, 1.0]) if (coordinates or stated) == "RAS" else np.ones(3)
-        merged = _merge_points(Surface(surface.points * sign * UNITS_MM[unit], surface.faces))
+        merged = Surface(surface.points * sign * UNITS_MM[unit], surface.faces)
+        if merge:
+            merged = _merge_points(merged)
         if not len(merged.faces):
             raise SurfaceError("the file holds no triangles", remedy="export the surface again")
         return merged
@@ -370,13 +374,19 @@ def _check_suffix(path: Path) -> None:
         )
 
 
-def _read_poly(path: Path) -> pv.PolyData:
+def _read_poly(path: Path, merge: bool) -> pv.PolyData:
     if path.suffix.lower() == ".vtp":
         _check_stated_counts(path)
     try:
         with silence_vtk(), warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            poly = _read_ply(path) if path.suffix.lower() == ".ply" else pv.read(str(path))
+            if path.suffix.lower() == ".ply":
+                poly = _read_ply(path)
+            else:
+                reader = pv.get_reader(str(path))
+                if isinstance(reader, pv.STLReader):
+                    reader.reader.SetMerging(merge)
+                poly = reader.read()
     except Exception:  # readers raise many kinds; all mean the same to the user
         raise SurfaceError("the surface cannot be read", remedy="export the surface again") from None
     if not isinstance(poly, pv.PolyData):

@@ -327,7 +327,12 @@ def draw_slices_figure(store: Results) -> Figure | None:
 
 def make_four_views(store: Results, skin: Any) -> list[View]:
     """Views of the whole limb, in the order of ``SIDES``."""
-    left, back, up = read_limb_frame(store)
+    return make_side_views(read_limb_frame(store), skin)
+
+
+def make_side_views(frame: Array, skin: Any) -> list[View]:
+    """Views of a surface, in the order of ``SIDES``; rows of the frame: its left, posterior and proximal."""
+    left, back, up = frame
     points = (np.asarray(skin.points) - skin.center) @ np.array([left, back, up]).T
     half = np.abs(points).max(axis=0) * 1.06 + 4
     width = 2 * max(half[0], half[1]) + 8

@@ -1,0 +1,199 @@
+"""Limbs as named bodies with the same triangles in each: read, told apart, and brought into correspondence.
+
+A limb is a file that holds all its bodies, or a folder with a file for each, named for it (``skin.stl``,
+``tibia.ply``).  Limbs are in correspondence where their triangles join the same points, in the same order.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..anatomy.surfaces.extraction import remesh
+from ..anatomy.surfaces.triangles import SUFFIXES, Surface, find_half_edges, number_components, read_surface
+from ..arrays import Array, Indices
+from ..errors import InputError
+from ..extensions import import_extra
+
+SMALLEST_FACES = 100  # of a body; what is smaller is left over from a segmentation
+TEMPLATE_EDGE_MM = 6.0  # of the limb that is bent onto the others
+SAME_POINT_MM = 0.01  # where corners of a file without shared points are one point
+# Steps of Amberg et al.: stiffness, weight of landmarks (there are none), weight of normals, iterations.
+_STEPS = [(0.02, 0.0, 0.5, 10), (0.01, 0.0, 0.5, 10), (0.002, 0.0, 0.5, 10)]
+
+
+@dataclass(frozen=True, eq=False)
+class LimbBodies:
+    """The bodies of a limb: points (n, 3) LPS mm, and of each body, by name, its faces (m, 3) of them."""
+
+    points: Array
+    faces: dict[str, Indices]
+
+    def extract(self, name: str) -> Surface:
+        """A body by itself; its points are in the order of the limb's."""
+        used, local = np.unique(self.faces[name], return_inverse=True)
+        return Surface(self.points[used], local.reshape(-1, 3))
+
+
+def read_bodies(paths: Sequence[Path], unit: str = "mm") -> list[LimbBodies]:
+    """Read limbs that are in correspondence.
+
+    Raises
+    ------
+    InputError
+        For limbs whose bodies or triangles differ, and as `read_surface` and `name_bodies`.
+    """
+    first, *others = [_read_limb(path, unit) for path in paths]
+    merged, index = _merge_corners(first[0])
+    faces = (
+        index[first[1]] if isinstance(first[1], np.ndarray) else {k: index[v] for k, v in first[1].items()}
+    )
+    named = faces if isinstance(faces, dict) else name_bodies(Surface(merged, faces), paths[0])
+    limbs = [LimbBodies(merged, named)]
+    for path, (points, own) in zip(paths[1:], others, strict=True):
+        if not _is_same(own, first[1]):
+            raise InputError(
+                f"its triangles are not those of {paths[0]}",
+                file=path,
+                remedy="give limbs in correspondence, or add --register",
+            )
+        moved = np.zeros_like(merged)
+        moved[index] = points
+        apart = np.linalg.norm(moved[index] - points, axis=1)
+        if apart.max() > SAME_POINT_MM:
+            raise InputError(
+                f"points that {paths[0]} joins are {apart.max():.2g} mm apart",
+                file=path,
+                remedy="give limbs in correspondence, or add --register",
+            )
+        limbs.append(LimbBodies(moved, named))
+    return limbs
+
+
+def _read_limb(path: Path, unit: str) -> tuple[Array, Indices | dict[str, Indices]]:
+    """Points as the files hold them, with faces; of a folder by the names of its files."""
+    if not path.is_dir():
+        surface = read_surface(path, unit=unit, merge=False)
+        return surface.points, surface.faces
+    files = sorted(file for file in path.iterdir() if file.suffix.lower() in SUFFIXES)
+    if not files:
+        raise InputError("no surfaces are there", file=path, remedy="give files such as skin.stl, tibia.stl")
+    points, faces, start = [], {}, 0
+    for file in files:
+        surface = read_surface(file, unit=unit, merge=False)
+        points.append(surface.points)
+        faces[file.stem.removeprefix("bone-")] = surface.faces + start
+        start += len(surface.points)
+    if "skin" not in faces:
+        raise InputError("no file is named skin", file=path, remedy="name each file for its body")
+    return np.vstack(points), faces
+
+
+def _merge_corners(points: Array) -> tuple[Array, Indices]:
+    """Points without those that coincide, and the number (n,) of each one among them."""
+    _, where, index = np.unique(np.round(points, 6), axis=0, return_index=True, return_inverse=True)
+    return points[where], index.ravel()
+
+
+def _is_same(faces: Any, others: Any) -> bool:
+    if isinstance(faces, dict) and isinstance(others, dict):
+        return faces.keys() == others.keys() and all(np.array_equal(faces[k], others[k]) for k in faces)
+    return not isinstance(faces, dict) and not isinstance(others, dict) and np.array_equal(faces, others)
+
+
+def name_bodies(surface: Surface, file: Path) -> dict[str, Indices]:
+    """Tell the bodies of a surface apart, by size and place; z is proximal.
+
+    The skin is the largest. Of one bone it is the femur (a thigh), of two tibia and fibula; of four the femur
+    is the larger, and the patella the smaller of the two that are higher.
+
+    Raises
+    ------
+    InputError
+        For another number of bodies.
+    """
+    pieces = number_components(find_half_edges(surface.faces), len(surface.points))[surface.faces[:, 0]]
+    bodies = [surface.faces[pieces == one] for one in np.unique(pieces)]
+    bodies = [one for one in bodies if len(one) >= SMALLEST_FACES]
+    bodies.sort(key=lambda one: -float(np.prod(np.ptp(surface.points[one].reshape(-1, 3), axis=0))))
+    skin, *bones = bodies or [np.zeros((0, 3), dtype=np.int64)]
+    bones.sort(key=lambda one: float(surface.points[one][..., 2].mean()))
+    match len(bones):
+        case 1:
+            return {"skin": skin, "femur": bones[0]}
+        case 2:
+            fibula, tibia = sorted(bones, key=len)
+            return {"skin": skin, "tibia": tibia, "fibula": fibula}
+        case 4:
+            (fibula, tibia), (patella, femur) = sorted(bones[:2], key=len), sorted(bones[2:], key=len)
+            return {"skin": skin, "femur": femur, "patella": patella, "tibia": tibia, "fibula": fibula}
+    raise InputError(
+        f"{len(bodies)} bodies, which cannot be told apart",
+        file=file,
+        remedy="give each limb as a folder with a file for each body: skin.stl, tibia.stl, ...",
+    )
+
+
+@dataclass(frozen=True)
+class Registration:
+    """How well a limb was met: distances of its surfaces from the bent template, mm."""
+
+    limb: Path
+    rms_mm: float
+    p95_mm: float
+
+
+def register_limbs(paths: Sequence[Path], unit: str = "mm") -> tuple[list[LimbBodies], list[Registration]]:
+    """Bring limbs into correspondence: the first one, remeshed, is bent onto each of the others.
+
+    The bending is that of Amberg, Romdhani and Vetter (CVPR 2007), by trimesh, body by body.
+
+    Raises
+    ------
+    InputError
+        For limbs with other bodies than the first, and as `read_bodies`.
+    """
+    registration = import_extra("trimesh.registration", "population", "registering limbs")
+    mesh = import_extra("trimesh", "population", "registering limbs").Trimesh
+    limbs = [read_bodies([path], unit)[0] for path in paths]
+    template = _make_template(limbs[0])
+    found, told = [], []
+    for path, limb in zip(paths, limbs, strict=True):
+        odd = sorted(limb.faces.keys() ^ template.faces.keys())
+        if odd:
+            raise InputError(
+                f"only one of it and {paths[0]} has a {odd[0]}", file=path, remedy="leave it out"
+            )
+        points, far = template.points.copy(), []
+        for name, faces in template.faces.items():
+            source, target = template.extract(name), limb.extract(name)
+            bent = registration.nricp_amberg(
+                mesh(_fill_box(source.points, target.points), source.faces, process=False),
+                mesh(target.points, target.faces, process=False),
+                steps=_STEPS,
+            )
+            points[np.unique(faces)] = bent
+            far.append(np.sqrt(Surface(bent, source.faces).find_nearest(target.points)[0]))
+        distances = np.concatenate(far)
+        found.append(LimbBodies(points, template.faces))
+        rms = float(np.sqrt((distances**2).mean()))
+        told.append(Registration(path, rms, float(np.percentile(distances, 95))))
+    return found, told
+
+
+def _fill_box(points: Array, target: Array) -> Array:
+    """Points (n, 3) stretched along the axes so that they fill the box of the target's: where to begin."""
+    low, size = target.min(axis=0), np.ptp(target, axis=0)
+    return low + (points - points.min(axis=0)) / np.ptp(points, axis=0) * size
+
+
+def _make_template(limb: LimbBodies) -> LimbBodies:
+    points, faces, start = [], {}, 0
+    for name in limb.faces:
+        even = remesh(limb.extract(name), TEMPLATE_EDGE_MM)
+        points.append(even.points)
+        faces[name] = even.faces + start
+        start += len(even.points)
+    return LimbBodies(np.vstack(points), faces)

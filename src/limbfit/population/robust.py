@@ -1,0 +1,123 @@
+"""A rule made robust: what it may change is drawn along with the people, and a surrogate of both is searched.
+
+The aim is the 90th percentile, over the people, of the worst regional pressure. The rule that the surrogate
+prefers is simulated for fresh people, beside the trial's first rule.
+"""
+
+from collections.abc import Sequence
+from copy import deepcopy
+
+import numpy as np
+from scipy.optimize import differential_evolution
+from scipy.stats import qmc
+
+from ..arrays import Array
+from ..errors import InputError, RunError
+from ..pipeline.engine.context import Listener
+from ..results.population import RobustRule
+from .answers import find_worst, fit_surrogate, resample_interval
+from .people import People
+from .running import DONE, PersonJob, TrialStore, run_jobs, run_people
+from .trial import RuleTable, Trial
+
+PERCENTILE = 90
+NAME = "robust"
+LEAST_PEOPLE = 12  # for the surrogate
+_FIRST = 1_000_000  # numbers of the people whose rule differs, and of the fresh ones, from here on
+_SEARCHED = 256  # people over which the percentile is predicted
+
+
+def find_robust_rule(trial: Trial, people: int, fresh: int, listener: Listener) -> RobustRule:
+    """Fit the surrogate to ``people``, search it, and check what it prefers on so many ``fresh`` ones.
+
+    Raises
+    ------
+    InputError
+        Where the trial states no ``[robust]``, or keys that the first rule does not have.
+    RunError
+        Where too few people could be simulated.
+    """
+    if trial.robust is None:
+        raise InputError("the trial does not say what may change", file=trial.file, place="robust.ranges")
+    if people < LEAST_PEOPLE or fresh < 2:
+        raise InputError(
+            f"{people} and {fresh} people are too few", remedy=f"give {LEAST_PEOPLE} and 2 or more"
+        )
+    keys = list(trial.robust.ranges)
+    low, high = np.array(list(trial.robust.ranges.values())).T
+    change_rule(trial, keys, low)  # refuses keys of areas that are not there
+    drawn = low + (high - low) * qmc.Sobol(len(keys), seed=trial.population.seed).random(people)
+    rules = [change_rule(trial, keys, values) for values in drawn]
+    jobs = [PersonJob(trial, (rule,), _FIRST + i) for i, rule in enumerate(rules)]
+    run_jobs(jobs, 0, people, listener)
+    source, store = People(trial), TrialStore(trial)
+    inputs, outputs = [], []
+
+    def draw_features(number: int) -> Array:
+        return source.to_features(np.array(list(source.draw(number).inputs.values())))
+
+    for job, values in zip(jobs, drawn, strict=True):
+        rows = store.read(job.rules)
+        rows = rows[(rows["person"] == job.number) & (rows["state"] == DONE)]
+        if len(rows):
+            inputs.append([*draw_features(job.number), *values])
+            outputs.append(_find_worst_of(rows)[0])
+    if len(outputs) < LEAST_PEOPLE:
+        raise RunError(f"{trial.file}: only {len(outputs)} of {people} people could be simulated")
+    surrogate = fit_surrogate(np.array(inputs), np.array(outputs))
+    everybody = np.array([draw_features(number) for number in range(1, _SEARCHED + 1)])
+
+    def predict_percentile(values: Array) -> float:
+        rows = np.hstack([everybody, np.tile(values, (len(everybody), 1))])
+        return float(np.percentile(surrogate.predict(rows), PERCENTILE))
+
+    found = differential_evolution(predict_percentile, list(zip(low, high)), maxiter=20, popsize=8, rng=0)
+    chosen = change_rule(trial, keys, found.x)
+    pair, first = (trial.rules[0], chosen), _FIRST + people
+    numbers = run_people(trial, fresh, rules=pair, first=first, listener=listener)
+    rows = store.read(pair)
+    rows = rows[rows["person"].isin(numbers)]
+    before, after = (_find_worst_of(rows[rows["rule"] == rule.name]) for rule in pair)
+    seen = np.array([[*draw_features(number), *found.x] for number in numbers])
+    return RobustRule(
+        keys=dict(zip(keys, map(float, found.x), strict=True)),
+        predicted_p90_kPa=float(found.fun),
+        checked_people=len(numbers),
+        checked_p90_kPa=float(np.percentile(after, PERCENTILE)),
+        beside_p90_kPa=float(np.percentile(before, PERCENTILE)),
+        difference_kPa=float((after - before).mean()),
+        interval_kPa=resample_interval(after - before, lambda drawn: drawn.mean(axis=-1)),
+        surrogate_error_kPa=float(np.sqrt(((surrogate.predict(seen) - after) ** 2).mean())),
+    )
+
+
+def _find_worst_of(rows: object) -> Array:
+    """The worst pressure of each person of stored rows of one rule."""
+    values = rows[rows["load"] != ""]  # type: ignore[index]
+    return find_worst(
+        values.pivot_table(index="person", columns=["load", "place", "quantity"], values="value")
+    )
+
+
+def change_rule(trial: Trial, keys: Sequence[str], values: Array) -> RuleTable:
+    """The trial's first rule with other values of some keys.
+
+    Raises
+    ------
+    InputError
+        For the depth of an area that the rule does not have.
+    """
+    socket = deepcopy(trial.rules[0].socket)
+    for key, value in zip(keys, map(float, values), strict=True):
+        if key == "reduction_percent":
+            socket[key] = value
+            continue
+        name = key.removesuffix(" depth_mm")
+        area = next((one for one in socket.get("areas", ()) if one.get("name") == name), None)
+        if area is None:
+            what = f"the rule {trial.rules[0].name!r} has no area {name!r}"
+            raise InputError(
+                what, file=trial.file, place="robust.ranges", remedy="name one of rules.socket.areas"
+            )
+        area["depth_mm"] = value
+    return RuleTable(name=NAME, socket=socket)
