@@ -58,7 +58,7 @@ def check_design(study: Study, limb: LimbGeometry | None, options: Mapping[str, 
         if min(depths) <= DEEPEST_SHARE * measure_tissue_under(limb.anatomy, *limb.place(site), width):
             fitting.append(site)
     if len(fitting) < sites:
-        what = f"{min(depths):g} mm is no deeper than half of the tissue at {len(fitting)} of {sites} sites"
+        what = f"{min(depths):g} mm is no deeper than half of the tissue at {len(fitting)} sites, not {sites}"
         raise StudyError(
             what, file=study.file, place="--depths", remedy="give smaller depths, or fewer sites"
         )
@@ -142,7 +142,8 @@ def _choose_designs(
     study = context.study
     every = [one for one, _ in found]
     if len({one.site for one in every}) < sites:
-        raise RunError(f"only {len(every)} candidates could be simulated: {'; '.join(left_out)}")
+        there = len({one.site for one in every})
+        raise RunError(f"only {there} of {sites} sites could be simulated: {'; '.join(left_out)}")
     problem = build_problem(study)
     names, prior = problem.unknowns.names, compute_prior_information(problem.unknowns, problem.space)
     before = np.linalg.slogdet(prior)[1]
