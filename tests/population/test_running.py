@@ -102,6 +102,17 @@ def test_dask_gives_the_same_table(tmp_path):
     pd.testing.assert_frame_equal(read(plain), read(other))
 
 
+@pytest.mark.slow
+def test_a_rule_is_made_robust_and_checked_on_fresh_people(tmp_path):
+    folder = make(tmp_path / "trial", TRIAL + "[robust]\nranges = { reduction_percent = [0.0, 5.0] }\n")
+    found = limbfit.make_robust(folder, people=12, fresh=2)["robust"]
+    # A looser socket presses less, and the limb's end bears.
+    assert found["keys"]["reduction_percent"] < 2.0
+    assert found["interval_kPa"][1] < 0.0
+    assert found["checked_p90_kPa"] < found["beside_p90_kPa"]
+    assert found["checked_people"] == 2
+
+
 def test_a_rule_that_fits_no_limb_is_refused_in_one_line(tmp_path):
     area = '[rules.socket]\nareas = [{ name = "a", region = "shin", radius_mm = 20.0, depth_mm = 3.0 }]\n'
     folder = make(tmp_path / "trial", TRIAL.replace("[[limits]]\n", area + "[[limits]]\n"))

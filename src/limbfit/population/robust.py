@@ -17,13 +17,12 @@ from ..pipeline.engine.context import Listener
 from ..results.population import RobustRule
 from .answers import find_worst, fit_surrogate, resample_interval
 from .people import People
-from .running import DONE, PersonJob, TrialStore, run_jobs, run_people
+from .running import DONE, FIRST_APART, PersonJob, TrialStore, run_jobs, run_people
 from .trial import RuleTable, Trial
 
 PERCENTILE = 90
 NAME = "robust"
 LEAST_PEOPLE = 12  # for the surrogate
-_FIRST = 1_000_000  # numbers of the people whose rule differs, and of the fresh ones, from here on
 _SEARCHED = 256  # people over which the percentile is predicted
 
 
@@ -46,9 +45,10 @@ def find_robust_rule(trial: Trial, people: int, fresh: int, listener: Listener) 
     keys = list(trial.robust.ranges)
     low, high = np.array(list(trial.robust.ranges.values())).T
     change_rule(trial, keys, low)  # refuses keys of areas that are not there
-    drawn = low + (high - low) * qmc.Sobol(len(keys), seed=trial.population.seed).random(people)
-    rules = [change_rule(trial, keys, values) for values in drawn]
-    jobs = [PersonJob(trial, (rule,), _FIRST + i) for i, rule in enumerate(rules)]
+    sequence = qmc.Sobol(len(keys), seed=trial.population.seed)
+    drawn = low + (high - low) * sequence.random_base2(people.bit_length())[:people]
+    rules = [change_rule(trial, keys, values, f"{NAME} {i}") for i, values in enumerate(drawn, 1)]
+    jobs = [PersonJob(trial, (rule,), FIRST_APART + i) for i, rule in enumerate(rules)]
     run_jobs(jobs, 0, people, listener)
     source, store = People(trial), TrialStore(trial)
     inputs, outputs = [], []
@@ -71,9 +71,9 @@ def find_robust_rule(trial: Trial, people: int, fresh: int, listener: Listener) 
         rows = np.hstack([everybody, np.tile(values, (len(everybody), 1))])
         return float(np.percentile(surrogate.predict(rows), PERCENTILE))
 
-    found = differential_evolution(predict_percentile, list(zip(low, high)), maxiter=20, popsize=8, rng=0)
+    found = differential_evolution(predict_percentile, list(zip(low, high)), maxiter=20, popsize=8, seed=0)
     chosen = change_rule(trial, keys, found.x)
-    pair, first = (trial.rules[0], chosen), _FIRST + people
+    pair, first = (trial.rules[0], chosen), FIRST_APART + people
     numbers = run_people(trial, fresh, rules=pair, first=first, listener=listener)
     rows = store.read(pair)
     rows = rows[rows["person"].isin(numbers)]
@@ -99,7 +99,7 @@ def _find_worst_of(rows: object) -> Array:
     )
 
 
-def change_rule(trial: Trial, keys: Sequence[str], values: Array) -> RuleTable:
+def change_rule(trial: Trial, keys: Sequence[str], values: Array, name: str = NAME) -> RuleTable:
     """The trial's first rule with other values of some keys.
 
     Raises
@@ -112,12 +112,12 @@ def change_rule(trial: Trial, keys: Sequence[str], values: Array) -> RuleTable:
         if key == "reduction_percent":
             socket[key] = value
             continue
-        name = key.removesuffix(" depth_mm")
-        area = next((one for one in socket.get("areas", ()) if one.get("name") == name), None)
+        place = key.removesuffix(" depth_mm")
+        area = next((one for one in socket.get("areas", ()) if one.get("name") == place), None)
         if area is None:
-            what = f"the rule {trial.rules[0].name!r} has no area {name!r}"
+            what = f"the rule {trial.rules[0].name!r} has no area {place!r}"
             raise InputError(
                 what, file=trial.file, place="robust.ranges", remedy="name one of rules.socket.areas"
             )
         area["depth_mm"] = value
-    return RuleTable(name=NAME, socket=socket)
+    return RuleTable(name=name, socket=socket)

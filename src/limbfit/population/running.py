@@ -36,6 +36,7 @@ STORE, PEOPLE, FIELDS = "people.parquet", "people", "skin-pressure"
 COLUMNS = ("person", "rule", "state", "text", "load", "place", "quantity", "value")
 DONE, FAILED, REJECTED, INPUT = "done", "failed", "rejected", "input"
 WHOLE = "the limb"
+FIRST_APART = 1_000_000  # numbers from here on are those of the search for a robust rule
 _NEAR_MM = 15.0  # from a point of the skin to the mesh's outer surface, beyond the liner
 _MOST_DRAWN = 4  # times the people that are wanted: a trial that rejects more than it takes has a fault
 _REGION = ("mean_kPa", "peak_kPa", "shear_kPa", "shear_peak_kPa")
@@ -74,10 +75,11 @@ class TrialStore:
         return self.folder / f"{number:05d}-{digest}.parquet"
 
     def read(self, rules: Sequence[RuleTable] | None = None) -> Any:
-        """All rows of these rules (the trial's) as a data frame; those of other digests are left out."""
+        """All rows of these rules as a data frame; by default those of the trial's rules, and of its people."""
         pandas = import_pandas()
-        ends = [self.file(0, rule).name[5:] for rule in rules or self.trial.rules]
-        files = sorted(file for file in self.folder.glob("*.parquet") if file.name[5:] in ends)
+        known = [_split_name(self.file(0, rule))[1] for rule in rules or self.trial.rules]
+        found = sorted((*_split_name(file), file) for file in self.folder.glob("*.parquet"))
+        files = [file for number, end, file in found if end in known and (rules or number < FIRST_APART)]
         if not files:
             return pandas.DataFrame({name: [] for name in COLUMNS})
         return pandas.concat([pandas.read_parquet(file) for file in files], ignore_index=True)
@@ -93,12 +95,22 @@ class TrialStore:
             frame.to_parquet(stream, index=False)
 
     def drop_stale(self, rules: Sequence[RuleTable]) -> int:
-        """Delete rows that no rule's digest knows any more; how many files there were."""
-        ends = [self.file(0, rule).name[5:] for rule in rules]
-        stale = [file for file in self.folder.glob("*.parquet") if file.name[5:] not in ends]
+        """Delete rows of people that no rule's digest knows any more; how many files there were.
+
+        People of the search for a robust rule, whose numbers are apart, are kept.
+        """
+        known = [_split_name(self.file(0, rule))[1] for rule in rules]
+        found = [(file, *_split_name(file)) for file in self.folder.glob("*.parquet")]
+        stale = [file for file, number, end in found if number < FIRST_APART and end not in known]
         for file in stale:
             file.unlink()
         return len(stale)
+
+
+def _split_name(file: Path) -> tuple[int, str]:
+    """The person's number and the digest in the name of a file of rows."""
+    number, _, digest = file.stem.partition("-")
+    return int(number), digest
 
 
 @dataclass(frozen=True)
