@@ -75,7 +75,7 @@ class TrialStore:
         return self.folder / f"{number:05d}-{digest}.parquet"
 
     def read(self, rules: Sequence[RuleTable] | None = None) -> Any:
-        """All rows of these rules as a data frame; by default those of the trial's rules, and of its people."""
+        """All rows of these rules as a data frame; by default those of the trial and its people."""
         pandas = import_pandas()
         known = [_split_name(self.file(0, rule))[1] for rule in rules or self.trial.rules]
         found = sorted((*_split_name(file), file) for file in self.folder.glob("*.parquet"))
