@@ -8,7 +8,7 @@ import typer
 import limbfit
 
 from ..errors import InputError
-from ..results.population import PopulationResult, ShapeModelResult
+from ..results.population import WORST_PLACE, PopulationResult, ShapeModelResult
 from .console import (
     AsJson,
     Column,
@@ -143,17 +143,16 @@ def show_population(found: PopulationResult) -> None:
             "95 % (%)": lambda row: format_ends(row.interval_percent, ".0f"),
         }
         print_table(found.shares, columns)
-    regional = [one for one in found.differences if one.quantity == "mean_kPa"]
-    if regional:
+    worst = [one for one in found.differences if one.place == WORST_PLACE]
+    if worst:
         columns = {
             "rule": lambda row: f"{row.rule} - {row.beside}",
-            "load": "load",
             "place": "place",
             "mean difference (kPa)": ("difference", ".1f"),
             "95 % (kPa)": lambda row: format_ends(row.interval, ".1f"),
             "lower for (%)": ("lower_percent", ".0f"),
         }
-        print_table(regional, columns)
+        print_table(worst, columns)
     if found.drivers:
         columns = {
             "rule": "rule",

@@ -14,6 +14,7 @@ from scipy.stats import binomtest
 from ..arrays import Array
 from ..extensions import import_extra
 from ..results.population import (
+    WORST_PLACE,
     Driver,
     PopulationResult,
     Quantity,
@@ -26,7 +27,7 @@ from .people import People
 from .running import DONE, FAILED, INPUT, REJECTED, WHOLE, TrialStore, list_done
 from .trial import LimitTable, Trial
 
-WORST_PLACE, WORST_QUANTITY, ANY_LOAD = "worst region", "mean_kPa", "any load"
+WORST_QUANTITY, ANY_LOAD = "mean_kPa", "any load"
 LEAST_PEOPLE = 16  # for a surrogate: with fewer, its error at people left out says nothing
 FOLDS = 8
 _DRAWS = 2000  # of a bootstrap

@@ -12,9 +12,8 @@ from ..report.drawing.plots import add_legend, choose_tissue_style, make_figure,
 from ..report.formats import format_duration, format_fixed
 from ..report.page import Figure, KeyNumber, Note, Page, Section, make_bullets
 from ..report.words import make_prose, make_section, make_table, write_words
-from ..results.population import Driver, PopulationResult, Quantity
+from ..results.population import WORST_PLACE, Driver, PopulationResult, Quantity
 from ..web import build_patient_frame
-from .answers import WORST_PLACE
 from .people import People
 from .running import FIELDS, WHOLE, TrialStore, find_person_folder, list_done
 from .trial import Trial

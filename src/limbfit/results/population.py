@@ -7,6 +7,8 @@ from pydantic import Field
 
 from .base import Interval, ResultPart, StoredResult
 
+WORST_PLACE = "worst region"  # of a person: the region with the largest mean pressure under any load
+
 
 class ShapeModelResult(ResultPart):
     """How good a shape model is."""
