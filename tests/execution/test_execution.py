@@ -186,6 +186,11 @@ def test_an_answer_that_cannot_travel_is_an_error_not_a_death(pool):
         list(pool.map(unpicklable, [0]))
 
 
+def test_jobs_can_each_have_a_new_process():
+    with ProcessExecutor(1, renew=True) as own:
+        assert len(set(own.map(pid, range(3)))) == 3
+
+
 def test_a_dead_worker_costs_one_retry(pool, tmp_path):
     jobs = [str(tmp_path / f"died-{k}") for k in range(3)]
     assert list(pool.map(die_once, jobs)) == ["alive"] * 3

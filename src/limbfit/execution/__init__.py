@@ -65,11 +65,12 @@ def share_executor(executor: Executor) -> AbstractContextManager[None]:
     return set_in_block(_shared, executor)
 
 
-def make_executor(workers: int = 0, limits: Limits = NO_LIMITS) -> Executor:
+def make_executor(workers: int = 0, limits: Limits = NO_LIMITS, renew: bool = False) -> Executor:
     """Make an executor with that many workers, one thread each; 0 means one worker per usable core.
 
-    One worker means this process itself. `place_jobs` and `share_executor` take precedence. Raises
-    `InputError` for a scheduler or a batch system that cannot be used.
+    One worker means this process itself, unless every job is to have a new process (``renew``). `place_jobs`
+    and `share_executor` take precedence. Raises `InputError` for a scheduler or a batch system that cannot be
+    used.
     """
     shared, placement = _shared.get(), _placement.get() or Placement()
     if shared is not None:
@@ -79,7 +80,9 @@ def make_executor(workers: int = 0, limits: Limits = NO_LIMITS) -> Executor:
     count = (workers if placement.workers is None else placement.workers) or count_usable_cores()
     if placement.dask is not None:
         return DaskExecutor.from_queue(placement.dask, count, limits)
-    return ProcessExecutor(count, limits=limits) if count > 1 else SerialExecutor()
+    if count > 1 or renew:
+        return ProcessExecutor(count, limits=limits, renew=renew)
+    return SerialExecutor()
 
 
 class _SharedExecutor(Executor):

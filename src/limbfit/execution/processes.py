@@ -181,12 +181,15 @@ class ProcessExecutor(Executor):
 
     They start when first needed, and never run the caller's script again, guarded or not. A worker that dies
     (killed, out of memory, crashed) or exceeds the ``limits`` is replaced, and its job is tried once more.
+    With ``renew`` every job has a new process: what long jobs leave in memory goes with it.
     """
 
-    def __init__(self, workers: int, threads: int = 1, limits: Limits = NO_LIMITS) -> None:
+    def __init__(
+        self, workers: int, threads: int = 1, limits: Limits = NO_LIMITS, renew: bool = False
+    ) -> None:
         if workers < 1 or threads < 1:
             raise ValueError("workers and threads must be at least 1")
-        self.threads, self.limits = threads, limits
+        self.threads, self.limits, self.renew = threads, limits, renew
         self._seats: list[Worker | None] = [None] * workers
         self._seat_of_key: dict[str, int] = {}
         self._mapping = False
@@ -220,6 +223,8 @@ class ProcessExecutor(Executor):
                         job = busy.pop(seat)
                         if isinstance(outcome, JobOutcome):
                             answers[job] = outcome
+                            if self.renew:
+                                self._replace(seat)
                         elif tries[job] < MAX_TRIES:
                             waiting.insert(0, job)
                         elif batch.on_lost is not None:

@@ -246,7 +246,7 @@ def run_jobs(jobs: Sequence[PersonJob], before: int, wanted: int, listener: List
         end = f"; about {left / 60:.0f} min left" if left else ""
         listener(Progress("people", before + done, wanted, f"person {job.number}, {words}{end}"))
 
-    with lock(trial.results), make_executor(trial.execution.workers, limits) as executor:
+    with lock(trial.results), make_executor(trial.execution.workers, limits, renew=True) as executor:
         for number in executor.map(simulate_person, jobs, on_lost=_store_loss, on_report=tell):
             shares[number] = 1.0
 
