@@ -13,8 +13,9 @@ from limbfit.priors import LITERATURE, POPULATION
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
 from layer_compressions import Footprint, Layers
-from population import DATA, SQUARE, THREE, TWO, constant, exponent, seen_in, steps
 from population_fit import Fit, Legs, coverage, fit, predict
+
+from population import DATA, SQUARE, THREE, TWO, constant, exponent, seen_in, steps
 
 STORED = tomllib.loads(POPULATION.read_text(encoding="utf-8"))
 needs_data = pytest.mark.skipif(not DATA.is_file(), reason="needs shared/data/multis/measurements.csv")

@@ -10,12 +10,12 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
 import solved_layers
 from layer_compressions import Footprint, Layers
-from population import SQUARE
 from population_fit import fit
 from solved_layers import C_MPA, LOADS_N, ROUNDING_MM, Rectangle, SolvedDesign, SolvedFootprint, press_layers
 from test_population import TRUE, made
 
 from limbfit.shapes.shape import Square
+from population import SQUARE
 
 
 def test_small_compressions_are_those_of_linear_theory(monkeypatch: pytest.MonkeyPatch) -> None:
