@@ -40,7 +40,7 @@ from limbfit.acquire import (
 from limbfit.acquire.line_protocol import (
     HOST_LINE,
     PINS,
-    Accepted,
+    Acceptance,
     Bye,
     Decoder,
     Encoder,
@@ -185,7 +185,7 @@ def _trial(connection: socket.socket, random: np.random.Generator) -> float:
                         armed, start, shown = True, time.monotonic(), 0
                     if isinstance(command, Stop) and not stopped_at:
                         stopped_at = arrived
-                    connection.sendall(encoder.encode(Accepted(line.number).body)[1])
+                    connection.sendall(encoder.encode(Acceptance(line.number).body)[1])
         elif armed:
             shown += 1
             force = random.integers(-90, 90, PINS)

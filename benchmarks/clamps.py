@@ -53,7 +53,7 @@ def compare(site: TrueSite, mesh: Mesh, along: Any, force: float) -> dict[str, A
     problem, control = site_problem(site, mesh), StepControl()
     bare = solve(problem, control)
     table = ClampsTable(force_N=force)
-    begun = table.begun_s
+    begun = table.lead_s
     later = replace(problem, history=problem.history.delay(begun), touch_down_s=begun)
     found = solve(clamp_problem(later, along, table), control)
     for result in (bare, found):

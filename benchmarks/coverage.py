@@ -45,7 +45,7 @@ from limbfit.pipeline.engine.store import Store, read_json
 from limbfit.pipeline.identification.search import build_unknowns
 from limbfit.pipeline.records.records import SiteRecord, estimate_site_deviation, load_site_record
 from limbfit.pipeline.uncertainty.uncertainty import EMULATOR
-from limbfit.traces import Regularised, TouchDown, Trace, find_touch_down, regularise
+from limbfit.traces import RegularisedCurve, TouchDown, Trace, find_touch_down, regularise
 
 Array = NDArray[np.float64]
 BEFORE_S = 0.3  # in the air
@@ -127,7 +127,7 @@ class Robot:
 
     def regularised(
         self, random: np.random.Generator, record: SiteRecord, force: Array, smoothing: float
-    ) -> tuple[Regularised, Array]:
+    ) -> tuple[RegularisedCurve, Array]:
         """The smoothed record, from touch-down on, and what was smoothed away."""
         end = record.times_s[-1]
         time = np.arange(0.0, BEFORE_S + end + 1e-9, 1 / RATE_HZ)

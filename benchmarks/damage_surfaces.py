@@ -129,7 +129,7 @@ def holes(random: Random, whole: Whole, folder: Path) -> Inputs:
 
 @kind("surfaces", "refused", "inward")
 def inside_out(random: Random, whole: Whole, folder: Path) -> Inputs:
-    return spoiled(random, whole, folder, lambda surface: surface.flipped)
+    return spoiled(random, whole, folder, lambda surface: surface.flipped_surface)
 
 
 @kind("surfaces", "repaired", "looked inward and were turned")

@@ -49,6 +49,6 @@ def _beside(indenter: Indenter, skin: Array, angle: float) -> Indenter:
     low, high = 0.0, 60.0
     while high - low > 1e-3:
         middle = 0.5 * (low + high)
-        clear = float(ball.moved(middle).signed_distance(skin).min()) > CLEAR_MM
+        clear = float(ball.move(middle).signed_distance(skin).min()) > CLEAR_MM
         low, high = (middle, high) if clear else (low, middle)
-    return ball.moved(low)
+    return ball.move(low)

@@ -47,7 +47,7 @@ def run_febio_on(program: Path, run: Run, study: Path, folder: Path, limit_s: fl
         done = run_febio(
             program, place, compute_end_time(problem), "forces.txt", threads=run.threads, time_limit_s=limit_s
         )
-        log = read_log(place / "forces.txt") if done.verdict.completed else None
+        log = read_log(place / "forces.txt") if done.verdict.is_completed else None
     peak = None if log is None else float(build_result(problem, log, done.verdict, done.seconds).peak_force)
     return {
         "site": run.site,
@@ -55,7 +55,7 @@ def run_febio_on(program: Path, run: Run, study: Path, folder: Path, limit_s: fl
         "nodes": int(problem.mesh.points.shape[0]),
         "seconds": done.seconds,
         "peak_force_N": peak,
-        "stopped": "" if done.verdict.completed else done.verdict.reason,
+        "stopped": "" if done.verdict.is_completed else done.verdict.reason,
     }
 
 

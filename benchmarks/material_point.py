@@ -47,7 +47,7 @@ def solve_layer(
     while targets:
         t = targets.pop(0)
         dt, depth = t - times[-1], float(history.at(t))
-        increment = memory.build_increment(point, laws, t, dt, depth, 0.0, Drives.none())
+        increment = memory.build_increment(point, laws, t, dt, depth, 0.0, Drives.make_empty())
         scale, offset = float(increment.scale[0]), float(increment.history[0, 0, 0])
         elastic = max(depth, 0.0) ** power
         force = scale * elastic + offset

@@ -16,9 +16,10 @@ from pathlib import Path
 import numpy as np
 from layer_compressions import Footprint
 from numpy.typing import NDArray
-from population import DATA, LOWER_LEG, OBLONG, SQUARE, THREE, TWO, Model, viscosity
 from population_fit import FORCE_N, SITES, Fit, Legs, fit, predict_held_out, within
 from solved_layers import SolvedDesign, SolvedFootprint, press_layers, read_compressions
+
+from population import DATA, LOWER_LEG, OBLONG, SQUARE, THREE, TWO, Model, viscosity
 
 Array = NDArray[np.float64]
 

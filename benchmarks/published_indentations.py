@@ -15,11 +15,11 @@ from pathlib import Path
 import numpy as np
 from layer_compressions import Footprint
 from numpy.typing import NDArray
-from population import DATA, SQUARE
 from population_fit import SITES, read_legs
 from solved_layers import LAYER_MM, layered_quarter, probe_of, quarter_problem
 
 from limbfit.fe import History, Indenter, NeoHookean, Ogden, OgdenQLV, Problem, StepControl, solve
+from population import DATA, SQUARE
 
 Array = NDArray[np.float64]
 

@@ -183,7 +183,7 @@ def advance(tool: Indenter, points: Array, farthest: float = 60.0) -> float:
     ahead = points[np.linalg.norm(across, axis=1) < tool.width]
 
     def clear(distance: float) -> bool:
-        return not len(ahead) or float(tool.moved(distance).signed_distance(ahead).min()) > 0.0
+        return not len(ahead) or float(tool.move(distance).signed_distance(ahead).min()) > 0.0
 
     low, step = 0.0, 4.0
     while low < farthest and clear(low + step):

@@ -273,7 +273,7 @@ def run_draw(world: World, seed: int, hold_s: float, after_s: float) -> dict[str
     row: dict[str, Any] = {
         "named": any(one.verdict for one in quality),
         "times_noise": max(phase.times_noise for one in quality for phase in one.phases),
-        "prefers": relaxation.preferred,
+        "prefers": relaxation.preferred_model,
         "gives_way": GIVES_WAY in relaxation.describe(),
         "determined": [word == DETERMINED for word in known.verdicts],
         "still_determined": [word == DETERMINED for word in verdicts],

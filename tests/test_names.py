@@ -1,6 +1,7 @@
-"""Names tell what comes back: a function of a module begins with a verb, or converts one thing to another."""
+"""A function of a module begins with a verb, or converts one thing to another; a class is a noun."""
 
 import ast
+import re
 from functools import cache
 from pathlib import Path
 
@@ -85,3 +86,106 @@ def test_every_exception_is_needed():
 def test_the_list_of_verbs_holds_no_spare_word():
     first = {name.lstrip("_").split("_")[0] for _, name in functions()}
     assert sorted(VERBS - first) == []
+
+
+# No class ends and no function or method begins with one of these; a property may be an adjective, as keys of
+# what is stored are.
+PARTICIPLES = frozenset(
+    """
+    begun bent broken chosen done drawn driven frozen given gone grown hidden kept known left lost made seen
+    sent shown sunk taken told torn understood worn written
+    """.split()  # noqa: SIM905
+)
+PREPOSITIONS = frozenset(
+    """
+    above across after along among around at before behind below beside between beyond by during from in
+    inside into near of off on outside over through towards under until upon within without
+    """.split()  # noqa: SIM905
+)
+ADJECTIVES = frozenset(
+    """
+    alike blunt deaf each explicit first flat hollow interactive last lower plain plausible single straight
+    suspect uncoupled upper upright vain whole
+    """.split()  # noqa: SIM905
+)
+NOUNS_AND_VERBS = frozenset({"embed", "feed", "need", "ring", "speed", "spring", "string", "warning"})
+NOT_NOUNS = {
+    "Coupling": "a noun of mechanics",
+    "Finding": "a noun: what was found",
+    "LayerThinning": "a noun: how much thinner a layer is",
+    "Painting": "a noun: what was painted",
+    "Recording": "a noun: what was recorded",
+    "RegionFitted": "limbfit schema and docs/results.md show it",
+    "RelaxationBeyond": "limbfit schema and docs/results.md show it",
+    "ShareOver": "limbfit schema and docs/results.md show it",
+    "SocketDesigned": "limbfit schema and docs/results.md show it",
+    "TissueStrainInside": "limbfit schema and docs/results.md show it",
+    "Uncoupled": "FEBio's term for such laws; extensions derive theirs from it",
+    "_Crossing": "a noun: where a line crosses a face",
+}
+NOT_VERBS = {
+    "at": "the value at a time or point: users call that of History, Motion and Pressure",
+    "by_tissue": "users call it of Study",
+    "coupling": "a noun of mechanics",
+    "_coupling": "a noun of mechanics",
+    "in_solver_units": "users call it of TissueLaw",
+    "meshing": "a command",
+    "of": "a constructor: users call that of Motion, Shape and SmoothSurface",
+    "of_record": "users call it of TissueLaw",
+    "of_tissues": "a constructor",
+    "recording": "a command",
+    "revolved": "users import it",
+    "scaling": "a command",
+    "waiting": "users import it",
+}
+
+
+def is_no_head(word: str) -> bool:
+    """Neither a noun nor a verb."""
+    regular = re.fullmatch("[a-z]+(ed|ing)", word) and word not in NOUNS_AND_VERBS
+    return bool(regular) or word in PARTICIPLES | PREPOSITIONS | ADJECTIVES
+
+
+def is_property(node: ast.FunctionDef | ast.AsyncFunctionDef) -> bool:
+    return any(ast.unparse(one).endswith("property") for one in node.decorator_list)
+
+
+@cache
+def definitions() -> tuple[dict[str, str], dict[str, str]]:
+    """File of each class, and of each function and method that is no property, of all depths, by name."""
+    classes, called = dict[str, str](), dict[str, str]()
+    for path in sorted(PACKAGE.rglob("*.py")):
+        file = path.relative_to(PACKAGE).as_posix()
+        for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+            if isinstance(node, ast.ClassDef):
+                classes[node.name] = file
+            elif isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef) and not is_property(node):
+                called[node.name] = file
+    return classes, called
+
+
+def find_not_nouns() -> set[str]:
+    return {name for name in definitions()[0] if is_no_head(re.findall("[A-Z][a-z0-9]*", name)[-1].lower())}
+
+
+def find_not_verbs() -> set[str]:
+    """Those of one word, or that begin with a preposition: an adjective before a noun is a measure's name."""
+    words = {name: name.strip("_").split("_") for name in definitions()[1]}
+    return {
+        name
+        for name, (first, *more) in words.items()
+        if first in PREPOSITIONS - {"from"} or (not more and is_no_head(first) and first not in VERBS)
+    }
+
+
+def test_classes_are_nouns():
+    assert sorted(find_not_nouns() - NOT_NOUNS.keys()) == []
+
+
+def test_methods_are_no_participles_adjectives_or_prepositions():
+    assert sorted(find_not_verbs() - NOT_VERBS.keys()) == []
+
+
+def test_every_exception_to_the_parts_of_speech_is_needed():
+    assert sorted(NOT_NOUNS.keys() - find_not_nouns()) == []
+    assert sorted(NOT_VERBS.keys() - find_not_verbs()) == []

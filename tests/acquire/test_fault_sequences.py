@@ -22,7 +22,7 @@ from hypothesis.stateful import (
 from in_process import Bench
 
 from limbfit.acquire.line_protocol import PINS
-from limbfit.acquire.protocol import Abort, LinkLost, Phase, Signal
+from limbfit.acquire.protocol import Abort, LinkLoss, Phase, Signal
 from limbfit.acquire.virtual import FAULT_KINDS, Fault
 
 WAY = [
@@ -90,10 +90,10 @@ class Sequences(RuleBasedStateMachine):
         for _ in range(ms):
             self.bench.millisecond(device=False)
 
-    @rule(event=st.sampled_from([Signal.KEY_DOWN, Signal.KEY_UP, Abort("the operator"), LinkLost("cut")]))
+    @rule(event=st.sampled_from([Signal.KEY_DOWN, Signal.KEY_UP, Abort("the operator"), LinkLoss("cut")]))
     def operator(self, event) -> None:
         self.bench.session.handle(event, self.bench.now)
-        if isinstance(event, LinkLost):
+        if isinstance(event, LinkLoss):
             self.bench.device.disconnect()
 
     @rule(which=st.integers(0, 10_000), noise=st.binary(max_size=200))

@@ -8,7 +8,7 @@ import pytest
 from typer.testing import CliRunner
 
 from limbfit.acquire import LineDevice, connect
-from limbfit.acquire.virtual import Serving
+from limbfit.acquire.virtual import Endpoint
 from limbfit.cli import app
 from limbfit.errors import InputError, RunError
 from limbfit.pipeline.commands.acquire import acquire_site
@@ -58,9 +58,9 @@ def test_ports_that_cannot_be_listened_at() -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         with pytest.raises(InputError, match=f"port {port} cannot be taken: .*; give another, or 0"):
-            Serving.on_port("127.0.0.1", port)
+            Endpoint.listen_on_port("127.0.0.1", port)
     with pytest.raises(InputError, match=r"--host: no\.such\.host\.invalid is no address of this machine"):
-        Serving.on_port("no.such.host.invalid", 0)
+        Endpoint.listen_on_port("no.such.host.invalid", 0)
 
 
 @pytest.mark.parametrize(

@@ -27,7 +27,7 @@ from acquiring import SPEED, fitsocket, start
 from limbfit.acquire import LineDevice, LiveUpdate, Session, connect, read_recording, run_session
 from limbfit.acquire.line_protocol import Encoder, Flags, Sample, SetLimits
 from limbfit.acquire.protocol import Abort, Phase, Signal
-from limbfit.acquire.virtual import Fault, Serving, read_faults
+from limbfit.acquire.virtual import Endpoint, Fault, read_faults
 from limbfit.errors import RunError
 from limbfit.pipeline.records.traces import read_record
 from limbfit.study import load_study
@@ -135,7 +135,7 @@ def wait_for_record(study, samples: int) -> Path:
 def device_here(study, *, faults: tuple[Fault, ...] = (), speed: float = float(SPEED)):
     """A virtual FitSocket on a port, in a thread of this process; its address and that thread."""
     device = limbfit.virtual_fitsocket(load_study(study, recorded=False), faults=faults, paced=speed > 1)
-    serving = Serving.on_port("127.0.0.1", 0)
+    serving = Endpoint.listen_on_port("127.0.0.1", 0)
     how = {"speed": speed, "tell": lambda line: None}
     thread = Thread(target=limbfit.serve_fitsocket, args=(device, serving), kwargs=how)
     thread.start()
@@ -257,7 +257,7 @@ def test_two_sessions_over_one_serial_port(ready) -> None:
             ending = run_session(session, events)
             assert (ending.phase, ending.reason) == (Phase.STOPPED, "enough")
             assert session.samples > 20
-            assert device.refused.total == 0
+            assert device.refusals.total == 0
 
 
 @pytest.mark.slow

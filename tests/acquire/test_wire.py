@@ -11,9 +11,8 @@ from limbfit.acquire.line_protocol import (
     DEVICE_LINE,
     HOST_LINE,
     PINS,
-    Accepted,
+    Acceptance,
     Bye,
-    Declined,
     Decoder,
     Encoder,
     Fence,
@@ -21,14 +20,15 @@ from limbfit.acquire.line_protocol import (
     Hello,
     Hold,
     Identity,
-    LimitTripped,
+    LimitTrip,
     Move,
     NotePhase,
     NoteSite,
-    OutOfReach,
+    Rejection,
     Sample,
     SetLimits,
     Stop,
+    StuckPins,
     derive_salt,
     format_sample,
     parse_command,
@@ -50,7 +50,7 @@ COMMANDS = [
 ]
 WHO = Identity(1, "f" * 16, 14, 500, 60_000, 50_000, 12_500, "real", "FitSocket-2", "SN.12", "2024-05-01")
 SAMPLE = Sample(7, 123_456, 8, 5, tuple(range(PINS)), tuple(range(-7, 7)), tuple(range(100, 114)))
-REPORTS = [WHO, Accepted(5), Declined(6, "speed"), LimitTripped("watchdog", 0), OutOfReach(0b101), SAMPLE]
+REPORTS = [WHO, Acceptance(5), Rejection(6, "speed"), LimitTrip("watchdog", 0), StuckPins(0b101), SAMPLE]
 
 
 @pytest.mark.parametrize("command", COMMANDS, ids=lambda c: type(c).__name__)
@@ -168,7 +168,7 @@ def hostile(bench: Bench) -> dict[str, bytes]:
 @pytest.mark.parametrize("kind", ["malformed", "checksum", "replayed", "oversized", "unknown"])
 def test_the_device_acts_on_none_of_them(kind: str) -> None:
     bench = session_in(Phase.READY)
-    motors, refused = bench.device.motors, bench.device.refused
+    motors, refused = bench.device.motors, bench.device.refusals
     before = getattr(refused, kind)
     line = hostile(bench)[kind]
     answer = bench.device.feed(line)
@@ -183,10 +183,10 @@ def test_moves_beyond_the_limits_are_declined() -> None:
     wire.send(SetLimits(1, 25_000, 25_000, 30_000, 8000, 500), 0.0)
     for move, code in ((Move(1, 40_000, 1000), "position"), (Move(1, 20_000, 9000), "speed")):
         wire.send(move, 0.0)
-        assert [r.code for r in wire.receive() if isinstance(r, Declined)] == [code]
+        assert [r.code for r in wire.receive() if isinstance(r, Rejection)] == [code]
     wire.send(Stop(""), 0.0)
     wire.send(Move(1, 20_000, 1000), 0.0)
-    assert [r.code for r in wire.receive() if isinstance(r, Declined)] == ["stopped"]
+    assert [r.code for r in wire.receive() if isinstance(r, Rejection)] == ["stopped"]
     assert not wire._link.far.motors.driving.any()
 
 
@@ -196,7 +196,7 @@ def test_nothing_moves_without_a_session() -> None:
     assert not far.motors.driving.any()
     wire = connect(far)
     wire.send(Move(1, 20_000, 1000), 0.0)
-    assert [r.code for r in wire.receive() if isinstance(r, Declined)] == ["not-armed"]
+    assert [r.code for r in wire.receive() if isinstance(r, Rejection)] == ["not-armed"]
 
 
 def test_the_documented_exchange_is_what_is_spoken() -> None:
@@ -213,5 +213,5 @@ def test_the_documented_exchange_is_what_is_spoken() -> None:
         SetLimits(1, 25_000, 25_000, 60_000, 8000, 20),
         Heartbeat(2),
     ]
-    assert [parse_report(line.body, line.number) for line in host_end.feed(accepted)] == [Accepted(1)]
+    assert [parse_report(line.body, line.number) for line in host_end.feed(accepted)] == [Acceptance(1)]
     assert device_end.refused.total == host_end.refused.total == 0

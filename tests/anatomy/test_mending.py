@@ -60,7 +60,7 @@ def test_an_open_surface_with_turned_triangles_is_capped_as_one_without(whole):
 
 
 def test_a_surface_that_looks_inward_as_a_mirrored_one_does_is_refused(whole):
-    for surface in (whole.skin.flipped, turned(whole.skin.flipped, slice(0, None, 5))):
+    for surface in (whole.skin.flipped_surface, turned(whole.skin.flipped_surface, slice(0, None, 5))):
         with pytest.raises(SurfaceError, match=r"inverted|oriented against each other"):
             build_closed_anatomy(surface, whole.bones)
 

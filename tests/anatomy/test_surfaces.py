@@ -30,13 +30,13 @@ def ball(radius: float = 50.0, centre=(10.0, -20.0, 30.0)) -> Surface:
     """A closed sphere, outward."""
     sphere = pv.Icosphere(radius=radius, center=centre, nsub=3)
     surface = Surface(np.asarray(sphere.points), sphere.regular_faces)
-    return surface if surface.volume > 0 else surface.flipped
+    return surface if surface.volume > 0 else surface.flipped_surface
 
 
 def test_measures_of_a_box():
     box = pv.Box((0, 100, 0, 50, 0, 20)).triangulate()
     surface = Surface(np.asarray(box.points), box.regular_faces)
-    surface = surface if surface.volume > 0 else surface.flipped
+    surface = surface if surface.volume > 0 else surface.flipped_surface
     assert surface.volume == pytest.approx(100 * 50 * 20)
     assert surface.area == pytest.approx(2 * (5000 + 2000 + 1000))
     away = surface.points + np.array([1e4, -1e4, 1e4])
@@ -101,7 +101,7 @@ def dented_through(surface):
     ("damage", "expected"),
     [
         (opened, "open, .* edges have a face on one side only.*close its holes"),
-        (lambda s: s.flipped, "inverted.*flip the normals"),
+        (lambda s: s.flipped_surface, "inverted.*flip the normals"),
         (with_inner_wall, "more than two faces"),
         (half_flipped, "oriented against"),
         (doubled, "2 separate bodies"),

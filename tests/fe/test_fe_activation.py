@@ -10,7 +10,16 @@ from test_fe_fibres import ASKEW, GROUND, LINES, TISSUE, bent, body
 
 from limbfit import History, OgdenQLV, Problem
 from limbfit.errors import ProblemError
-from limbfit.fe import Activation, Contractile, Fibred, StepControl, Support, System, iterate, solve
+from limbfit.fe import (
+    Activation,
+    ContractileMaterial,
+    FibredMaterial,
+    StepControl,
+    Support,
+    System,
+    iterate,
+    solve,
+)
 from limbfit.fe.kernel.laws import Laws
 from limbfit.fe.observables import compute_element_fields
 from limbfit.fe.system import Increment
@@ -19,7 +28,9 @@ ELASTIC = OgdenQLV(0.005, 4.0, 0.0, 1.0)
 RAMP = Activation([0.0, 1.0], [0.0, 1.0])
 
 
-def bar(tissue: Contractile, held: bool, end_s: float = 1.0, activation: Activation = RAMP) -> Problem:
+def bar(
+    tissue: ContractileMaterial, held: bool, end_s: float = 1.0, activation: Activation = RAMP
+) -> Problem:
     """A cube with fibres along x, its sides free; its ends are held, or free too."""
     mesh = block("hex8", LINES, LINES, LINES)
     planes = [Support(np.flatnonzero(mesh.points[:, i] == 0.0), i) for i in range(3)]
@@ -34,7 +45,7 @@ def bar(tissue: Contractile, held: bool, end_s: float = 1.0, activation: Activat
 
 def test_a_free_bar_shortens_until_the_ground_bears_the_active_stress():
     """At constant volume ``c/m (2 l^m + ...)`` along and across: ``T = 2 c/m (sinh(m e) + sinh(m e/2))``."""
-    tissue = Contractile(Fibred(replace(ELASTIC, kappa_ratio=1e4), 0.0, 1.0), 0.01)
+    tissue = ContractileMaterial(FibredMaterial(replace(ELASTIC, kappa_ratio=1e4), 0.0, 1.0), 0.01)
     result = solve(bar(tissue, held=False), StepControl(load_steps=5, tolerance=1e-10), store="all")
     assert result.completed, result.reason
     stretch = 1.0 + result.states[-1].u[:, 0].min()
@@ -49,7 +60,7 @@ def test_a_free_bar_shortens_until_the_ground_bears_the_active_stress():
 
 def test_a_held_bar_pulls_with_the_active_stress_and_does_not_relax():
     """Sides free, length held: the stress along is the active one; it stays in a hold of relaxing tissue."""
-    tissue = Contractile(Fibred(replace(GROUND, kappa_ratio=1e4), 0.02, 3.0), 0.004)
+    tissue = ContractileMaterial(FibredMaterial(replace(GROUND, kappa_ratio=1e4), 0.02, 3.0), 0.004)
     held = Activation([0.0, 1.0, 9.0], [0.0, 1.0, 1.0])
     times = StepControl(times=(0.5, 1.0, 3.0, 9.0), tolerance=1e-10)
     problem = bar(tissue, True, 9.0, held)
@@ -65,7 +76,7 @@ def test_a_held_bar_pulls_with_the_active_stress_and_does_not_relax():
 @pytest.mark.parametrize("element", ["", "tet10p0"])
 def test_forces_and_tangent_are_derivatives(element):
     system, passive = body("tet10", element)
-    laws = Laws.build([OgdenQLV(0.009, 6.0, 2.0, 0.5), Contractile(TISSUE, 0.1)])
+    laws = Laws.build([OgdenQLV(0.009, 6.0, 2.0, 0.5), ContractileMaterial(TISSUE, 0.1)])
     K = 0.001 * np.random.default_rng(2).normal(size=(*system.weights.shape, 6))
     step = Increment(0.0, 0.0, np.array([1.5, 2.5]), K, 1.0, activation=0.7)
     u = bent(system)
@@ -77,7 +88,7 @@ def test_forces_and_tangent_are_derivatives(element):
 
 def test_sensitivities_of_a_contracting_muscle_under_a_punch():
     """It tenses while it is pressed; forces by the active stress, the fibres and the ground."""
-    muscle = Contractile(TISSUE, 0.006)
+    muscle = ContractileMaterial(TISSUE, 0.006)
     problem = punch(
         "hex8", 2, 1, 4.0, materials={"skin": GROUND, "muscle": muscle}, fibres=ASKEW,
         activation=Activation([0.0, 4.0, 9.0], [0.0, 1.0, 0.5]),
@@ -99,7 +110,7 @@ def test_the_force_between_steps_turns_where_contraction_does():
         "tet10", 2, 1, z=FINE_Z, history=History(np.array([0.0, 1.0, 10.0]), np.array([0.0, 3.0, 3.0])),
         fibres=(1.0, 0.0, 0.0), activation=Activation([0.0, 4.0, 4.5, 10.0], [0.0, 0.0, 1.0, 1.0]),
     )  # fmt: skip
-    tissue = Contractile(Fibred(problem.materials["muscle"], 0.001, 1.0), 0.02)
+    tissue = ContractileMaterial(FibredMaterial(problem.materials["muscle"], 0.001, 1.0), 0.02)
     problem = problem.with_materials({**problem.materials, "muscle": tissue})
     found = solve(problem, StepControl(tolerance=1e-5))
     fine = solve(
@@ -113,7 +124,7 @@ def test_the_force_between_steps_turns_where_contraction_does():
 
 def test_contraction_is_no_strain_energy():
     """What fibres shorten by themselves strains the ground, and nothing else stores energy."""
-    tissue = Contractile(Fibred(ELASTIC, 0.01, 1.0), 0.01)
+    tissue = ContractileMaterial(FibredMaterial(ELASTIC, 0.01, 1.0), 0.01)
     problem = bar(tissue, held=False)
     (step,) = iterate(problem, StepControl(times=(1.0,)))
     system, laws = System(problem), Laws.build([tissue, tissue])
@@ -125,12 +136,12 @@ def test_contraction_is_no_strain_energy():
 
 def test_what_cannot_be_is_refused():
     with pytest.raises(ProblemError, match=r"active = -1\.0 is negative"):
-        Contractile(TISSUE, -1.0)
+        ContractileMaterial(TISSUE, -1.0)
     with pytest.raises(ProblemError, match="acts at no stated time"):
-        solve(replace(bar(Contractile(TISSUE, 0.01), True), activation=None))
+        solve(replace(bar(ContractileMaterial(TISSUE, 0.01), True), activation=None))
     with pytest.raises(ProblemError, match="do not grow from 0"):
         Activation([1.0, 2.0], [0.0, 1.0])
     with pytest.raises(ProblemError, match="negative or not finite"):
         Activation([0.0, 1.0], [0.0, -1.0])
     with pytest.raises(ProblemError, match="have no direction"):
-        solve(replace(bar(Contractile(Fibred(GROUND, 0.0, 1.0), 0.01), True), fibres=None))
+        solve(replace(bar(ContractileMaterial(FibredMaterial(GROUND, 0.0, 1.0), 0.01), True), fibres=None))

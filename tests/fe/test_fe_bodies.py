@@ -84,7 +84,7 @@ def test_forces_and_stiffness_of_a_free_body_are_derivatives_of_its_energy(mu, t
     drives, grips = Drives(loads, np.ones((1, 6), dtype=bool), np.ones(1)), ()
     if mu:
         before = u - 0.05 * d
-        grip = Coulomb.none(mu, system.bodies.first.surface).advance(
+        grip = Coulomb.begin(mu, system.bodies.first_body.surface).advance(
             system.bodies.tools(before, drives)[0], None
         )
         grips = (grip.renew(system.bodies.tools(u, drives)[0]),)
@@ -164,7 +164,7 @@ def test_a_body_goes_over_from_displacement_to_force():
     """Pressed 3 mm and held, then left with the force that it had at the end: it creeps on from there."""
     problem = punch("hex8", 2, 1)
     pressed = Motion.of([0.0, 1.0, 3.0], z=[0.0, 3.0, 3.0])
-    tool = RigidBody(problem.indenter.moved(1.0), problem.contact_faces, pressed)
+    tool = RigidBody(problem.indenter.move(1.0), problem.contact_faces, pressed)
     control = replace(CONTROL, times=(0.25, 0.5, 0.75, 1.0, 2.0, 3.0), tolerance=1e-8)
     still = History([0.0, 3.0], [0.0, 0.0])
     plain = solve(replace(problem, indenter=None, bodies=(tool,), history=still), control)
@@ -198,7 +198,7 @@ def test_a_force_that_is_taken_over_depends_on_the_parameters():
     problem = punch("hex8", 2, 1)
     pressed = Motion.of([0.0, 1.0, 2.0], z=[0.0, 3.0, 3.0])
     left = Motion.of([0.0, 1.0, 1.5], force={"z": [np.nan, 0.5, 0.5]})
-    tool = RigidBody(problem.indenter.moved(1.0), problem.contact_faces, pressed.then(left), 0.4)
+    tool = RigidBody(problem.indenter.move(1.0), problem.contact_faces, pressed.then(left), 0.4)
     problem = replace(problem, indenter=None, bodies=(tool,), history=History([0.0, 3.5], [0.0, 0.0]))
     control = replace(CONTROL, times=(0.5, 1.0, 2.0, 2.5, 3.0, 3.5), penalty=20.0)
     centre = solve(problem, control, sensitivities=True, store="all")
@@ -417,7 +417,7 @@ def test_a_press_fit_is_lames_and_comes_off_by_its_friction():
     mesh = sector(np.linspace(inner, outer, 13), n)
     height = float(mesh.points[:, 2].max())
     shape = ring(outer - overlap, outer + overlap, n, 4.0 * height)
-    shape = shape.moved(-4.5 * height)
+    shape = shape.move(-4.5 * height)
     push = Motion.of([0.0, 1.0, 2.0], z=[0.0, 6.5 * height, 7.0 * height])
     body = RigidBody(shape, mesh.face_sets["outside"], push, mu)
     problem = quarter_tube(mesh, law, body)

@@ -99,7 +99,7 @@ def clamped_pipe() -> Problem:
     """Pins of 8 N on stiff tissue, before the test pin touches it."""
     table = ClampsTable(force_N=8.0)
     problem = site(pipe())
-    later = replace(problem, history=problem.history.delay(table.begun_s), touch_down_s=table.begun_s)
+    later = replace(problem, history=problem.history.delay(table.lead_s), touch_down_s=table.lead_s)
     return clamp_problem(later, UP, table)
 
 
@@ -135,7 +135,7 @@ def test_a_clamped_limb_bulges_between_the_pins_and_is_indented_from_there():
     problem, control = site(pipe()), StepControl(load_steps=4, unload_steps=3)
     bare = solve(problem, control)
     table = ClampsTable(force_N=8.0, settling_s=2.0)
-    begun = table.begun_s
+    begun = table.lead_s
     later = replace(problem, history=problem.history.delay(begun), touch_down_s=begun)
     found = solve(clamp_problem(later, UP, table), control)
     assert found.completed, found.reason

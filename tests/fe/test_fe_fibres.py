@@ -9,14 +9,14 @@ from scipy.optimize import fsolve
 
 from limbfit import History, OgdenQLV, Problem
 from limbfit.errors import ProblemError
-from limbfit.fe import Fibred, StepControl, Support, System, solve
+from limbfit.fe import FibredMaterial, StepControl, Support, System, solve
 from limbfit.fe.kernel.laws import Laws
 from limbfit.fe.memory import compute_elastic_stresses
 from limbfit.fe.observables import compute_element_fields
 from limbfit.fe.system import Increment
 
 GROUND = OgdenQLV(0.005, 4.0, 0.8, 0.4)
-TISSUE = Fibred(GROUND, k1=0.02, k2=3.0)
+TISSUE = FibredMaterial(GROUND, k1=0.02, k2=3.0)
 LINES = np.linspace(0.0, 1.0, 3)
 ASKEW = np.array([1.0, 2.0, 2.0]) / 3.0
 
@@ -73,7 +73,7 @@ def test_a_turned_body_has_turned_forces():
 @pytest.mark.parametrize("k1", [0.0, 0.02])
 def test_no_fibres_or_none_stretched_are_the_ground(k1):
     """Exactly: shortened along the fibres, and with k1 = 0."""
-    system, laws = body(tissue=Fibred(GROUND, k1, 3.0))
+    system, laws = body(tissue=FibredMaterial(GROUND, k1, 3.0))
     u = bent(system) if k1 == 0.0 else system.points @ (-0.2 * np.outer(ASKEW, ASKEW))
     plain, isotropic = body(tissue=GROUND, fibres=None)
     here, there = (a.evaluate(u, b, at_rest(a)) for a, b in ((system, laws), (plain, isotropic)))
@@ -81,7 +81,7 @@ def test_no_fibres_or_none_stretched_are_the_ground(k1):
     np.testing.assert_allclose(here.tangent, there.tangent, atol=1e-15 * np.abs(there.tangent).max())
 
 
-def pull(tissue: Fibred, stretch: float, along: bool) -> float:
+def pull(tissue: FibredMaterial, stretch: float, along: bool) -> float:
     """Nominal stress of a bar whose sides are free, MPa: fibres along it, or across along y."""
     ground, i = tissue.ground, 0 if along else 1
 
@@ -102,7 +102,7 @@ def pull(tissue: Fibred, stretch: float, along: bool) -> float:
 @pytest.mark.parametrize("along", [True, False])
 @pytest.mark.parametrize("stretch", [1.25, 0.75])
 def test_a_bar_along_and_across_its_fibres(along, stretch):
-    tissue = Fibred(OgdenQLV(0.005, 4.0, 0.0, 1.0), 0.02, 3.0)
+    tissue = FibredMaterial(OgdenQLV(0.005, 4.0, 0.0, 1.0), 0.02, 3.0)
     mesh = block("hex8", LINES, LINES, LINES)
     planes = [Support(np.flatnonzero(mesh.points[:, i] == 0.0), i) for i in range(3)]
     end = Support(np.flatnonzero(mesh.points[:, 0] == 1.0), 0, 1.0 if stretch > 1 else -1.0)
@@ -168,6 +168,6 @@ def test_impossible_directions_are_refused(fibres, what):
 
 def test_impossible_fibres_are_refused():
     with pytest.raises(ProblemError, match=r"k1 = -1\.0 is negative"):
-        Fibred(GROUND, -1.0, 3.0)
+        FibredMaterial(GROUND, -1.0, 3.0)
     with pytest.raises(ProblemError, match=r"k2 = 0\.0 is not positive"):
-        Fibred(GROUND, 0.01, 0.0)
+        FibredMaterial(GROUND, 0.01, 0.0)

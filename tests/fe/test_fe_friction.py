@@ -36,7 +36,7 @@ class Dragged:
         self.rng = np.random.default_rng(1)
         self.u = self.field(0.01)
         start = self.system.bodies.tools(self.u, drive(3.2))[0]
-        grip = Coulomb.none(mu, self.system.bodies.first.surface).advance(start, None)
+        grip = Coulomb.begin(mu, self.system.bodies.first_body.surface).advance(start, None)
         self.u = self.u + self.field(0.05)
         self.grip = self.renew(grip, self.u)
 

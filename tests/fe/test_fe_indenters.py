@@ -107,9 +107,9 @@ def test_starts_just_touching(name):
     tool = TOOLS[name]
     far = replace(tool, centre=(0.4, 0.3, 37.0), axis=(0.02, 0.01, -1.0))
     system = System(punch("hex8", 4, 1, indenter=far))
-    assert abs(system.bodies.first.surface.gaps_at_rest(system.indenter).min()) < 1e-6
-    ahead = far.moved(0.9 * np.linalg.norm(system.indenter.centre - np.array(far.centre)))
-    assert system.bodies.first.surface.gaps_at_rest(ahead).min() > 0
+    assert abs(system.bodies.first_body.surface.gaps_at_rest(system.indenter).min()) < 1e-6
+    ahead = far.move(0.9 * np.linalg.norm(system.indenter.centre - np.array(far.centre)))
+    assert system.bodies.first_body.surface.gaps_at_rest(ahead).min() > 0
 
 
 def test_force_under_a_box_of_triangles_is_that_under_the_square():

@@ -170,7 +170,7 @@ def iterations(divisions: int) -> int:
     system, laws, data = at_rest(build_punched_block("tet10", divisions))
     factor = Factor(system, laws.moduli, "multigrid")
     factor.factorise(data)
-    b = system.bodies.spread_forces(np.ones((system.bodies.first.surface.areas.size, 3, 1)))
+    b = system.bodies.spread_forces(np.ones((system.bodies.first_body.surface.areas.size, 3, 1)))
     found = factor.solve(data, b, None, 1e-3)
     assert found.converged
     assert np.linalg.norm(b - factor.multiply(data, found.x)) <= 1.1e-3 * np.linalg.norm(b)
@@ -207,7 +207,7 @@ def test_where_multigrid_does_not_converge_a_factor_takes_over():
     assert short.convex
     assert not short.converged
     assert factor.refactor_and_solve(data, b, None, 1e-6, short.x).converged
-    assert factor.lasting
+    assert factor.is_lasting
 
 
 def test_where_factors_are_dear_multigrid_takes_their_place(monkeypatch):

@@ -8,7 +8,7 @@ from samples import SAMPLES, energy, kirchhoff, moved, point, pressure, quotient
 from limbfit.errors import ProblemError
 from limbfit.fe import (
     VOLUMETRIC_LAWS,
-    Fibred,
+    FibredMaterial,
     History,
     MooneyRivlin,
     NeoHookean,
@@ -229,7 +229,7 @@ def test_a_parameter_that_a_material_does_not_have_is_refused_by_name():
     with pytest.raises(ProblemError, match="no parameter 'gama'; use one of c, m, gamma, tau"):
         OgdenQLV(0.005, 4.0, 1.0, 0.5).with_parameters({"gama": 2.0, "taus": 0.3})
     with pytest.raises(ProblemError, match="no parameter 'g1'; use one of mu"):
-        Fibred(NeoHookean(0.005), 0.01, 1.0).with_parameters({"g1": 2.0, "tau1": 0.3})
+        FibredMaterial(NeoHookean(0.005), 0.01, 1.0).with_parameters({"g1": 2.0, "tau1": 0.3})
 
 
 def test_lists_serve_as_well_as_tuples():

@@ -73,7 +73,7 @@ def test_travel_ends_at_the_bone(cases, site):
     body, problem = cases.body_of(case), cases.problem_of(case, 0)
     skin = np.unique(body.mesh.face_sets["skin"])
     depth = float(problem.history.displacement.max())
-    bottom = problem.indenter.moved(cases.advance(problem.indenter, body.mesh.points[skin]) + depth)
+    bottom = problem.indenter.move(cases.advance(problem.indenter, body.mesh.points[skin]) + depth)
     gap = bottom.signed_distance(body.mesh.points[body.bone]).min()
     assert gap >= -1e-4
     assert gap < 1e-4 or depth == pytest.approx(cases.FARTHEST_MM)

@@ -20,7 +20,9 @@ def test_forces_and_stiffness_of_anchors_are_derivatives_of_their_energy(rule):
     rest, rng, h = np.zeros((*system.weights.shape, 6)), np.random.default_rng(1), 1e-6
     u = 0.01 * rng.normal(size=system.points.shape) * ~system.supported
     d = rng.normal(size=u.shape) * ~system.supported
-    anchors = Anchors.none(system.bodies.first.surface).advance(system.bodies.tools(u, drive(1.6))[0], None)
+    anchors = Anchors.begin(system.bodies.first_body.surface).advance(
+        system.bodies.tools(u, drive(1.6))[0], None
+    )
     assert anchors.held.sum() > 4
 
     def at(u, advance):
@@ -39,7 +41,9 @@ def test_anchors_neither_push_nor_pull_along_the_normal():
     system = System(punch("tet10", 4, 1, friction="sticky"))
     laws = Laws.build([SKIN, MUSCLE])
     rest, u = np.zeros((*system.weights.shape, 6)), np.zeros_like(system.points)
-    anchors = Anchors.none(system.bodies.first.surface).advance(system.bodies.tools(u, drive(0.5))[0], None)
+    anchors = Anchors.begin(system.bodies.first_body.surface).advance(
+        system.bodies.tools(u, drive(0.5))[0], None
+    )
     at = system.evaluate(u, laws, Increment(0.0, -0.5, np.zeros(2), rest, 0.5, drive(-0.5), (anchors,)))
     assert anchors.held.any()
     assert at.force == 0.0
@@ -53,7 +57,7 @@ def slip_and_force(friction: str) -> tuple[float, np.ndarray]:
     tool = Indenter("sphere", 40.0, centre=(0.0, 0.0, 1.0))
     problem = punch("hex8", 2, 1, friction=friction, indenter=tool, contact_rule="nodes")
     system = System(problem)
-    nodes = system.bodies.first.surface.faces[:, 0]
+    nodes = system.bodies.first_body.surface.faces[:, 0]
     slip, forces, pressed, u = 0.0, [], np.zeros(len(nodes), dtype=bool), np.zeros_like(system.points)
     for step in iterate(problem, StepControl(load_steps=5, unload_steps=4)):
         gaps = system.bodies.tools(step.state.u, step.state.drives)[0].gaps[:, 0]

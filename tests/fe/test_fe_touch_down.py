@@ -9,7 +9,7 @@ from test_fe_fibres import ASKEW, GROUND, TISSUE
 
 from limbfit import History, Indenter, Problem
 from limbfit.errors import ProblemError
-from limbfit.fe import Activation, Contractile, Motion, RigidBody, StepControl, solve
+from limbfit.fe import Activation, ContractileMaterial, Motion, RigidBody, StepControl, solve
 
 HELD_S = 3.0
 COURSE = History(np.array([0.0, HELD_S, HELD_S + 5.0, HELD_S + 9.0]), np.array([0.0, 0.0, 5.0, 2.0]))
@@ -18,7 +18,7 @@ CONTROL = StepControl(load_steps=3, unload_steps=2, tolerance=1e-10)
 
 def tensed(active: float = 0.006, **changes) -> Problem:
     """A block whose muscle tenses before it is pressed."""
-    muscle = Contractile(TISSUE, active)
+    muscle = ContractileMaterial(TISSUE, active)
     tense = Activation([0.0, 1.0], [0.0, 1.0])
     changes = {"fibres": ASKEW, "activation": tense, "touch_down_s": HELD_S, "history": COURSE} | changes
     return punch("hex8", 2, 1, materials={"skin": GROUND, "muscle": muscle}, **changes)

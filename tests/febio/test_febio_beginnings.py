@@ -12,8 +12,8 @@ from limbfit.bench.timing import build_punched_block
 from limbfit.errors import ProblemError
 from limbfit.fe import (
     Activation,
-    Contractile,
-    Fibred,
+    ContractileMaterial,
+    FibredMaterial,
     History,
     Indenter,
     Motion,
@@ -38,7 +38,7 @@ from limbfit.febio import (
 from limbfit.febio.preparation import Preparation
 
 SKIN, MUSCLE = OgdenQLV(0.009, 6.0, 2.0, 0.5), OgdenQLV(0.004, 4.0, (0.8, 0.3), (0.2, 1.5))
-TENSED = Contractile(Fibred(MUSCLE, 0.012, 2.5), 0.01)
+TENSED = ContractileMaterial(FibredMaterial(MUSCLE, 0.012, 2.5), 0.01)
 ASKEW = np.array([1.0, -1.0, 0.5])
 TIMES = (0.5, 1.0, 2.0, 3.0)
 EXACT = StepControl(
@@ -46,14 +46,14 @@ EXACT = StepControl(
 )
 UP = np.array([0.0, 0.0, 1.0])
 TAUT = isochoric_stretch(UP, 0.9)[0]
-STILL = Contractile(Fibred(OgdenQLV(0.004, 4.0, 0.0, 1.0), 0.0, 1.0), 0.01)
+STILL = ContractileMaterial(FibredMaterial(OgdenQLV(0.004, 4.0, 0.0, 1.0), 0.0, 1.0), 0.01)
 
 
 def sheet(motion, x, axis=(0.0, 0.0, 1.0), name="sheet"):
     """Four triangles that look down, in a frame along ``axis``: read back as they are."""
     points = np.array([[x + u, v, 0.2] for u in (-8.0, 0.0, 8.0) for v in (-8.0, 8.0)])
     faces = np.array([[0, 1, 2], [1, 3, 2], [2, 3, 4], [3, 5, 4]])
-    shape = OpenSurface(points, faces).placed(np.zeros(3), np.array(axis), np.array([0.0, 1.0, 0.0]))
+    shape = OpenSurface(points, faces).place(np.zeros(3), np.array(axis), np.array([0.0, 1.0, 0.0]))
     shape = replace(shape, points=points @ shape.frame.T)
     return RigidBody(shape, build_punched_block("hex8", 6).mesh.face_sets["skin"], motion, name=name)
 

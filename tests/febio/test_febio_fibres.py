@@ -10,7 +10,7 @@ from limbfit import OgdenQLV
 from limbfit.bench.timing import build_punched_block
 from limbfit.errors import ProblemError
 from limbfit.fe import (
-    Fibred,
+    FibredMaterial,
     StepControl,
     solve,
 )
@@ -37,7 +37,7 @@ def test_fibres_are_read_back(tmp_path, ground, field):
     problem = build_punched_block("tet4", 4)
     count = len(problem.mesh.cells)
     fibres = np.random.default_rng(0).normal(size=(count, 3)) if field else np.array([0.3, -1.0, 0.2])
-    tissues = {"skin": OgdenQLV(0.009, 4.0, 1.0, 0.5), "muscle": Fibred(ground, 0.012, 2.5)}
+    tissues = {"skin": OgdenQLV(0.009, 4.0, 1.0, 0.5), "muscle": FibredMaterial(ground, 0.012, 2.5)}
     problem = replace(problem, materials=tissues, fibres=fibres)
     write_feb(problem, tmp_path / "model.feb")
     found = to_problem(read_feb(tmp_path / "model.feb"))
@@ -67,7 +67,7 @@ def test_an_input_with_fibres_is_read(tmp_path):
     axis = '<mat_axis type="vector"><a>0,2,0</a><d>1,0,0</d></mat_axis>'
     model = read_feb(mixed(tmp_path, axis=axis))
     (fat,) = model.materials.values()
-    assert fat == Fibred(OgdenQLV(0.004, 6.0, 2.0, 0.5, 200.0), 0.01, 3.0)
+    assert fat == FibredMaterial(OgdenQLV(0.004, 6.0, 2.0, 0.5, 200.0), 0.01, 3.0)
     np.testing.assert_array_equal(model.fibres["body"], [[0.0, 2.0, 0.0]])
     unsaid = read_feb(mixed(tmp_path))
     np.testing.assert_array_equal(unsaid.fibres["body"], [[1.0, 0.0, 0.0]])  # FEBio's default
@@ -93,7 +93,7 @@ def test_what_limbfit_has_not_is_refused_with_its_line(tmp_path, old, new, what)
 
 def test_abaqus_is_not_given_fibres(tmp_path):
     problem = build_punched_block("tet4", 4)
-    tissues = {name: Fibred(GROUND, 0.01, 3.0) for name in problem.mesh.region_names}
+    tissues = {name: FibredMaterial(GROUND, 0.01, 3.0) for name in problem.mesh.region_names}
     with pytest.raises(ProblemError, match="has fibres, which are written for FEBio only"):
         write_inp(
             replace(problem, materials=tissues, fibres=(1, 0, 0)), tmp_path / "m.inp", "abaqus", FebSettings()

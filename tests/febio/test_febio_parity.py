@@ -22,8 +22,8 @@ from limbfit import OgdenQLV
 from limbfit.bench.timing import build_punched_block
 from limbfit.fe import (
     Activation,
-    Contractile,
-    Fibred,
+    ContractileMaterial,
+    FibredMaterial,
     History,
     Indenter,
     Motion,
@@ -49,7 +49,7 @@ pytestmark = pytest.mark.febio
 SKIN, MUSCLE = OgdenQLV(0.009, 6.0, 2.0, 0.5), OgdenQLV(0.004, 4.0, (0.8, 0.3), (0.2, 1.5))
 FIVE = OgdenQLV(0.009, 6.0, (0.5, 0.4, 0.3, 0.2, 0.1), (0.05, 0.2, 1.0, 5.0, 20.0))
 ASKEW = np.array([1.0, -1.0, 0.5])
-FIBRED = Fibred(MUSCLE, 0.012, 2.5)
+FIBRED = FibredMaterial(MUSCLE, 0.012, 2.5)
 TAUT = isochoric_stretch(np.array([0.0, 0.0, 1.0]), 0.93)[0]
 DOWN = (0.0, 0.0, -1.0)
 PLATE = Indenter("square", 90.0, 4.0, (0.0, 0.0, 5.0), DOWN)
@@ -75,7 +75,7 @@ def run_both(program: Path, folder: Path, problem: Problem) -> tuple[Result, Res
     write_feb(problem, folder / "model.feb", FebSettings())
     end = Preparation.from_problem(problem).seconds + float(problem.history.times[-1])
     run = run_febio(program, folder, end, "forces.txt", time_limit_s=300.0)
-    assert run.verdict.completed, run.verdict.reason
+    assert run.verdict.is_completed, run.verdict.reason
     theirs = build_result(problem, run.log, run.verdict)
     times = tuple(t for t in theirs.times if t > 0.0)
     mine = solve(problem, StepControl(times=times, stress="linear", hold_penalty=True), store="none")
@@ -90,7 +90,7 @@ def differ_by(theirs: Result, mine: Result) -> float:
 
 CYCLES = History(np.array([0.0, 2.0, 6.0, 8.0, 10.0, 12.0]), np.array([0.0, 5.0, 5.0, 1.0, 5.0, 0.0]))
 TENSED = {
-    "materials": {"skin": SKIN, "muscle": Contractile(FIBRED, 0.005)},
+    "materials": {"skin": SKIN, "muscle": ContractileMaterial(FIBRED, 0.005)},
     "fibres": ASKEW,
     "activation": Activation([0.0, 1.0, 6.0], [0.0, 1.0, 0.4]),
 }
@@ -239,6 +239,6 @@ def test_febio_gives_again_what_is_stored_of_it(febio, tmp_path, case):
     stored = read_log(table)
     shutil.copy(file, tmp_path / "model.feb")
     run = run_febio(febio, tmp_path, float(stored.times[-1]), table.name, time_limit_s=300.0)
-    assert run.verdict.completed, run.verdict.reason
+    assert run.verdict.is_completed, run.verdict.reason
     assert run.log is not None
     np.testing.assert_allclose(run.log.values, stored.values, atol=1e-9 * np.abs(stored.values).max())

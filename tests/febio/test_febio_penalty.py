@@ -104,14 +104,16 @@ def test_every_face_has_its_own_penalty_over_its_own_area(rule, grown):
     modulus = np.mean([m.instantaneous_modulus for m in problem.materials.values()])
     rest = build_face_quadrature(problem.formulation, points, problem.contact_faces, "gauss")[1]
     uniform = compute_mean_penalty(contact, problem, 1.0) * modulus
-    np.testing.assert_allclose(uniform * system.bodies.first.surface.areas, own[:, None] * rest, rtol=1e-12)
+    np.testing.assert_allclose(
+        uniform * system.bodies.first_body.surface.areas, own[:, None] * rest, rtol=1e-12
+    )
     for t, stretch in ((1.0, 1.0), (2.0, np.sqrt(1.105))):  # 1.21 is as far from 1.105 as that from 1
         u = np.column_stack([(stretch - 1.0) * points[:, :2], np.zeros(len(points))])
         state, nothing = State(t, float(problem.history.at(t)), u, 1.0, None), np.zeros((1, 6))
         place = np.array([[0.0, 0.0, state.displacement, 0.0, 0.0, 0.0]])
         weights.update_after(Step(t, state.displacement, 0.0, 0.0, 0.0, 1, None, nothing, place, None, state))
     np.testing.assert_allclose(
-        uniform * system.bodies.first.surface.areas, grown * own[:, None] * rest, rtol=1e-9
+        uniform * system.bodies.first_body.surface.areas, grown * own[:, None] * rest, rtol=1e-9
     )
 
 

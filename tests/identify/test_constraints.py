@@ -106,7 +106,9 @@ def test_a_heavier_record_is_fitted_closer():
 def test_twenty_random_starts_between_the_bounds_end_at_the_same_optimum():
     data = records(0.03, seed=1)
     found = run_multistart(lambda number, unknowns: calibrate(simulate, data, unknowns), PAPER, 20, seed=4)
-    assert found.reached == 20, [(start.start, start.reason) for start in found.starts if not start.same]
+    assert found.reached_count == 20, [
+        (start.start, start.reason) for start in found.starts if not start.same
+    ]
     assert max(start.apart for start in found.starts) < 1.05
     assert max(start.cost for start in found.starts) == pytest.approx(found.best.cost, rel=5e-3)
     assert found.best.cost == min(start.cost for start in found.starts)
@@ -142,7 +144,7 @@ def test_starts_that_end_in_one_place_count_as_one_however_good_the_fit():
     found = run_multistart(run, PAPER, 6, seed=4)
     costs = [start.cost for start in found.starts]
     assert max(costs) > 1.5 * min(costs)
-    assert found.reached == 6, costs
+    assert found.reached_count == 6, costs
 
 
 def test_a_start_that_fails_is_told_and_the_others_count():
@@ -153,7 +155,7 @@ def test_a_start_that_fails_is_told_and_the_others_count():
     found = run_multistart(run, PAPER, 3, seed=1)
     assert [start.parameters is None for start in found.starts] == [False, True, False]
     assert "did not converge" in found.starts[1].reason
-    assert found.reached == 2
+    assert found.reached_count == 2
     with pytest.raises(CalibrationError, match="no simulation completes"):
         run_multistart(lambda n, u: calibrate(Counted(forbidden=lambda p: True), records(), u), PAPER, 1)
     with pytest.raises(CalibrationError, match="none of 2 starts"):

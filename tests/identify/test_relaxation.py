@@ -175,12 +175,12 @@ def test_derivatives_of_other_relaxations_are_those_of_differences(model):
 def test_a_tail_is_a_power_of_time():
     terms = RelaxationModel(0.2, 10.0).terms(TISSUES[0], np.r_[1.0, 2.0, 1e-9, 1e-3, TRUTH[4:]])
     for time in (1.0, 10.0, 100.0, 3600.0):
-        assert terms.at(time) == pytest.approx((1 + time / 10.0) ** -0.2, rel=0.01)
+        assert terms.evaluate(time) == pytest.approx((1 + time / 10.0) ** -0.2, rel=0.01)
 
 
 def test_records_of_the_model_prefer_it_and_leave_the_long_term_open(of_model):
     known = of_model.known
-    assert of_model.preferred == OWN
+    assert of_model.preferred_model == OWN
     assert known.verdicts[4] == DETERMINED
     verdicts = limit_verdicts(known.verdicts, known, of_model.summarise())
     assert verdicts[4] == "determined at 1 s and 10 s; its long-term value not"
@@ -200,7 +200,7 @@ def test_a_modulus_that_is_weakly_determined_at_all_times_is_not_called_undeterm
 
 
 def test_records_of_a_power_law_are_told_and_later_moduli_lie_inside(of_power_law):
-    assert of_power_law.preferred == POWER_LAW
+    assert of_power_law.preferred_model == POWER_LAW
     known = of_power_law.known
     verdicts = limit_verdicts(known.verdicts, known, of_power_law.summarise())
     assert DETERMINED not in (verdicts[2], verdicts[3], verdicts[4], verdicts[6], verdicts[7])
@@ -215,7 +215,7 @@ def test_records_of_two_terms_ask_for_a_further_term_and_later_moduli_lie_inside
     """Two times that are a factor of 30 apart; up to the records' end the moduli are then well known."""
     terms = [[(0.5 * gamma, 0.1), (0.5 * gamma, 3.0)] for gamma in TRUTH[[2, 6]]]
     found = assess(held_sites(), [site.relax(TRUTH, terms) for site in held_sites()])
-    assert found.preferred == FURTHER
+    assert found.preferred_model == FURTHER
     assert GIVES_WAY not in found.describe()
     for number, (c, _, gamma, _) in enumerate(TRUTH.reshape(2, 4)):
         _, (low, high) = found.state_modulus(number, 10.0)
@@ -248,7 +248,7 @@ def test_a_hold_of_a_minute_narrows_what_is_open_after_it(of_model):
 @pytest.mark.slow
 def test_a_hold_tells_a_power_law_of_time():
     found = assess_power_law(60.0)
-    assert found.preferred == POWER_LAW
+    assert found.preferred_model == POWER_LAW
     for number, true in enumerate(true_moduli(60.0)):
         low, high = found.state_modulus(number, 60.0)[1]
         assert low < true < high

@@ -8,7 +8,7 @@ import pytest
 
 from layered import block_context, block_study
 from limbfit.errors import InputError, StudyError
-from limbfit.fe import Contractile, OgdenQLV
+from limbfit.fe import ContractileMaterial, OgdenQLV
 from limbfit.indentation import SimulationJob, build_materials, build_problem, simulate
 from limbfit.mesh import read_vtu
 from limbfit.pipeline.commands.run import compute_keys
@@ -37,7 +37,7 @@ def test_the_core_contracts_and_no_other_tissue(tmp_path):
     assert study.fixed == ("skin.k1_kPa", "skin.k2", "skin.active_kPa")
     made = build_materials(TRUTH, 100.0, study.law.name, study.fibres)
     assert isinstance(made["skin"], OgdenQLV)
-    assert isinstance(made["muscle"], Contractile)
+    assert isinstance(made["muscle"], ContractileMaterial)
     assert made["muscle"].active == pytest.approx(0.006)
     assert study.material.course == ((0.0, 1.0),)
     assert study_of(tmp_path, law="ogden-fibres").material.course == ()

@@ -73,7 +73,7 @@ def test_a_clamped_site_is_indented_from_where_its_skin_is_then(context):
     """
     study = context.study
     model = build_model(context, study.sites[0])
-    start = np.array([study.material.of(tissue, "start")[key] for tissue, key in study.parameters])
+    start = np.array([study.material.get(tissue, "start")[key] for tissue, key in study.parameters])
     times = (0.0, 0.5 * model.knots_s[1], model.knots_s[1])  # the way in
 
     def force(values: np.ndarray, sensitivities: bool = False, **changes):

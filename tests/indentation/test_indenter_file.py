@@ -75,7 +75,7 @@ def test_a_changed_file_makes_calibration_and_simulations_stale(study):
     def keys() -> dict[str, str]:
         chain = compute_keys(study)
         own = [one for one in EXPERIMENTS if one.run.__module__.startswith("limbfit.")]  # no test's
-        return chain | {one.name: Keys(study).of(one, chain).digest for one in own}
+        return chain | {one.name: Keys(study).compute_key(one, chain).digest for one in own}
 
     before = keys()
     pv.Sphere(radius=8.0).save(table(study).file)

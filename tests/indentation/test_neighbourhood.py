@@ -136,7 +136,7 @@ def test_first_guesses_do_not_depend_on_what_was_simulated_before(site):
     simulating._prepared.clear()
     fresh = simulate(wanted)
     simulating._prepared.clear()
-    simulate(wanted.nested)
+    simulate(wanted.nested_job)
     simulate(job(replace(site, within_mm=RADIUS_MM), sensitivities=False))
     assert (simulate(wanted).force_N == fresh.force_N).all()
 

@@ -56,7 +56,7 @@ def test_terms_share_out_the_times_and_the_amplitude_of_one(terms):
 def test_a_study_with_two_terms_has_their_parameters_and_materials(tmp_path):
     study = study_of(tmp_path, more="start = { tau2_s = 3.0 }")
     assert [name for tissue, name in study.parameters if tissue == "skin"] == list(TRUTH)
-    assert study.material.of("skin", "start")["tau2_s"] == 3.0
+    assert study.material.get("skin", "start")["tau2_s"] == 3.0
     assert {"skin.c_kPa", "muscle.m"} <= study.priors.keys()  # what is known of people holds for all of them
     made = build_materials({"skin": TRUTH}, 80.0, study.law.name)["skin"]
     assert made == OgdenQLV(0.006, 5.0, (1.6, 0.9), (0.12, 2.2), 80.0)

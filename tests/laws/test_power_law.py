@@ -167,7 +167,7 @@ def test_febio_finds_the_same_force(tmp_path):
     run = run_febio(
         find_febio(), tmp_path, float(problem.history.times[-1]), "forces.txt", time_limit_s=600.0
     )
-    assert run.verdict.completed, run.verdict.reason
+    assert run.verdict.is_completed, run.verdict.reason
     found = build_result(problem, run.log, run.verdict)
     assert solve(problem).peak_force == pytest.approx(found.peak_force, rel=0.01)
 

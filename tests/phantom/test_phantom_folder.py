@@ -160,7 +160,7 @@ def test_a_tendon_is_a_tissue_of_the_study_and_a_label_of_its_map(with_tendon: P
     assert truth["tendon"]["c_kPa"] > 4.0 * truth["muscle"]["c_kPa"]
     assert truth["tendon"] | {"c_kPa": 0} == truth["muscle"] | {"c_kPa": 0}
     for name, _ in study.parameters:
-        lower, upper = (study.material.of(name, end)["c_kPa"] for end in ("lower", "upper"))
+        lower, upper = (study.material.get(name, end)["c_kPa"] for end in ("lower", "upper"))
         assert lower < truth[name]["c_kPa"] < upper
     labels = read_labels(study.path(study.segmentation.labels))
     assert labels.mask("patellar tendon").any()

@@ -94,7 +94,7 @@ def test_a_person_is_an_ordinary_study(tmp_path):
     assert study.socket.body_weight_N == pytest.approx(person.weight_N, abs=0.01)
     values = people.choose_parameters(person, study)
     assert values["muscle"]["c_kPa"] == person.inputs["muscle.c_kPa"]
-    assert values["muscle"]["tau_s"] == study.material.of("muscle", "start")["tau_s"]
+    assert values["muscle"]["tau_s"] == study.material.get("muscle", "start")["tau_s"]
     # The skin's points that correspond lie on the skin.
     far = np.abs(limb.surfaces["skin"].signed_distance(limb.skin_points))
     assert far.max() < 1.0

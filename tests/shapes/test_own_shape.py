@@ -95,7 +95,7 @@ def test_febio_is_given_its_front(tmp_path, shape):
     front = tool.points[np.unique(tool.front)]
     found = to_problem(read_feb(tmp_path / "model.feb")).indenter
     assert found is not None
-    start = problem.indenter.moved((np.array(found.centre) - problem.indenter.centre) @ found.frame[2])
+    start = problem.indenter.move((np.array(found.centre) - problem.indenter.centre) @ found.frame[2])
     assert np.abs(start.signed_distance(front)).max() < 1e-9
     ahead = np.random.default_rng(1).uniform([-7, -7, 0.1], [7, 7, 3], (200, 3)) @ start.frame
     ahead += np.asarray(start.centre)

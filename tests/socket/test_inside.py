@@ -23,7 +23,7 @@ def strains(gradient: np.ndarray) -> Strains:
     )  # fmt: skip
     system, table = System(problem), Laws.build(laws)
     u = mesh.points @ gradient.T
-    return Strains.of(system, table, State(0.0, 0.0, u, 0.0, memory=Memory.rest(system, table)))
+    return Strains.from_state(system, table, State(0.0, 0.0, u, 0.0, memory=Memory.rest(system, table)))
 
 
 @pytest.mark.parametrize("amount", [0.3, 1.2])
@@ -36,7 +36,7 @@ def test_simple_shear_is_the_closed_form(amount):
     np.testing.assert_allclose(found.shear, (longest**2 - longest**-2) / 4, rtol=1e-6)
     np.testing.assert_allclose(found.compression, (1 - longest**-2) / 2, rtol=1e-6)
     np.testing.assert_allclose(found.energy_kPa, 5.0 * amount**2, rtol=1e-6)  # mu/2 gamma^2
-    whole, _ = found.within(np.ones(len(CELLS), dtype=bool))
+    whole, _ = found.summarise_cells(np.ones(len(CELLS), dtype=bool))
     assert whole["volume_mm3"] == pytest.approx(1000.0)
     over = {f"{level:g}": pytest.approx(1000.0 * (whole["shear"] > level)) for level in SHEAR_LEVELS}
     assert whole["sheared_mm3"] == over
@@ -45,8 +45,8 @@ def test_simple_shear_is_the_closed_form(amount):
 def test_what_one_percent_of_the_volume_exceeds():
     volume = np.array([0.5, 1.5, 98.0])
     found = Strains(np.array([0.9, 0.6, 0.1]), np.array([0.1, 0.2, 0.3]), np.zeros(3), volume)
-    told, cell = found.within(np.ones(3, dtype=bool))
+    told, cell = found.summarise_cells(np.ones(3, dtype=bool))
     assert (told["shear"], told["shear_rare"], cell) == (0.9, 0.6, 0)
     assert told["compression_rare"] == told["compression"] == 0.3
     assert told["sheared_mm3"] == {"0.25": 2.0, "0.5": 2.0, "0.75": 0.5}
-    assert found.within(np.array([False, True, True]))[1] == 1
+    assert found.summarise_cells(np.array([False, True, True]))[1] == 1

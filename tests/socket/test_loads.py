@@ -20,7 +20,7 @@ def test_the_moment_is_that_of_the_force_on_its_line(name: str) -> None:
     load, known = STANDARD_LOADS[name], find_directions(round_limb())
     force, moment = load.force(800.0, known), load.moment(800.0, known)
     assert force @ known.proximal == pytest.approx(800.0 * load.proximal)
-    on_line = load.ahead_mm * known.anterior + load.inside_mm * known.medial
+    on_line = load.ahead_mm * known.anterior + load.inside_mm * known.medial_axis
     np.testing.assert_allclose(moment, np.cross(on_line + 0.7 * force, force), atol=1e-6)
     # A line ahead of the knee extends it: the moment on the shank turns its end forward, about medio-lateral.
     to_the_left = np.cross(known.proximal, known.anterior)

@@ -79,7 +79,7 @@ def test_unit_and_space(tmp_path: Path) -> None:
 
 
 def test_inside_out_is_turned_and_said(tmp_path: Path) -> None:
-    write_surface(tmp_path / "socket.stl", face().flipped)
+    write_surface(tmp_path / "socket.stl", face().flipped_surface)
     socket = read(tmp_path / "socket.stl")
     assert socket.volume_mm3 == pytest.approx(drawn().volume_mm3, rel=1e-5)
     assert "turned" in socket.notes[0]
@@ -122,7 +122,7 @@ def test_skin_and_bones_below_an_open_end_are_not_those_of_the_socket(tmp_path: 
 def test_of_a_wall_the_inner_side_is_taken(tmp_path: Path, turned: bool) -> None:
     body = walled()
     assert body.volume > 0
-    write_surface(tmp_path / "wall.stl", body.flipped if turned else body)
+    write_surface(tmp_path / "wall.stl", body.flipped_surface if turned else body)
     socket = read(tmp_path / "wall.stl")
     assert socket.volume_mm3 == pytest.approx(drawn().volume_mm3, rel=2e-3)
     assert len(socket.faces) == pytest.approx(len(drawn().faces), rel=0.01)
@@ -177,7 +177,7 @@ BAD: dict[str, tuple[Callable[[], Surface], str]] = {  # what is said, of what, 
         lambda: Surface(face().points * 25.4, face().faces),
         "say so (socket.unit)",
     ),
-    "no opening": (lambda: close_by_fans(face().flipped), "open"),
+    "no opening": (lambda: close_by_fans(face().flipped_surface), "open"),
     "a hole of": (with_hole, "close it; only brim and end may be open"),
     "does not surround the limb": (lambda: moved(150.0, 20.0, 0.0), "socket.space"),
     "is 310 mm off": (lambda: moved(0.0, 0.0, 400.0), "socket.space"),

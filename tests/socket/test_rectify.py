@@ -47,7 +47,7 @@ def check_face(socket: Socket, anatomy: Anatomy) -> None:
     skin = anatomy.skin
     face, clear = socket.surface, Surface(socket.clear, socket.faces)
     assert len(face.self_intersections) == len(clear.self_intersections) == 0
-    assert socket.closed.volume > 0
+    assert socket.closed_surface.volume > 0
     edges = np.sort(np.vstack([socket.faces[:, [i, (i + 1) % 3]] for i in range(3)]), axis=1)
     alone, counts = np.unique(edges, axis=0, return_counts=True)
     brim = np.sort(np.column_stack([socket.brim, np.roll(socket.brim, -1)]), axis=1)
@@ -64,7 +64,7 @@ def check_face(socket: Socket, anatomy: Anatomy) -> None:
 def closed_above(clear: Surface, anatomy: Anatomy) -> Surface:
     """The clear face carried on straight along the limb to far above its cut, and closed there."""
     socket = Socket(clear.points, clear.faces, clear.points, np.empty(0, dtype=int))
-    closed = socket.closed
+    closed = socket.closed_surface
     points = closed.points.copy()
     points[len(clear.points) :] += 1000.0 * anatomy.cut_normal  # the fan's middle: a cone above the brim
     rim = np.unique(closed.faces[(closed.faces >= len(clear.points)).any(axis=1)])
@@ -182,7 +182,7 @@ def test_where_the_limb_lies_does_not_matter() -> None:
     recipe = replace(PLAIN, trim=Trim([(turn @ [0.0, 0.0, 115.0] + shift, turn @ CUT_NORMAL)]))
     moved = rectify_limb(skin, build_limb_frame(turn @ limb.cut_point + shift, turn @ CUT_NORMAL), recipe)
     assert moved.volume_mm3 == pytest.approx(made_plain().volume_mm3, rel=1e-4)
-    assert moved.closed.volume > 0
+    assert moved.closed_surface.volume > 0
 
 
 BAD = {

@@ -67,7 +67,7 @@ def check_refused(told: tuple[int, str, str], *words: str) -> None:
 
 def test_a_face_inside_out_is_turned_and_said(limbfit, tmp_path, commands_unasked):
     study = with_file(tmp_path, FROM_FILE)
-    write_surface(study / "socket.stl", drawn().flipped)
+    write_surface(study / "socket.stl", drawn().flipped_surface)
     code, out, _ = limbfit("check", study)
     assert code == 0
     assert "socket: its triangles looked away from the tissue and were turned" in out
@@ -101,7 +101,7 @@ def test_a_load_that_a_frictionless_cylinder_cannot_carry_is_told_with_the_remed
     around = revolved(np.full(20, 29.0), np.linspace(200.0, 274.0, 20) - 300.0)
     side = np.abs(around.face_normals[:, 2]) < 0.5
     tube = Surface(around.points + anatomy.cut_point, around.faces[side])
-    write_surface(study / "socket.stl", remove_unused_points(tube).flipped)
+    write_surface(study / "socket.stl", remove_unused_points(tube).flipped_surface)
     code, _, err = limbfit("socket", study)
     told = err.splitlines()[-1]
     assert code == 1, err

@@ -28,8 +28,8 @@ def check_sides(limb: Anatomy) -> None:
     towards = {
         "anterior": known.anterior,
         "posterior": -known.anterior,
-        "medial": known.medial,
-        "lateral": -known.medial,
+        "medial": known.medial_axis,
+        "lateral": -known.medial_axis,
     }
     sides = [found[f"{side} {level}"] for side in SIDES for level in LEVELS]
     assert np.sum([region.faces for region in sides], axis=0).max() == 1  # none overlap
@@ -65,7 +65,7 @@ def test_regions_of_real_limbs(name: str) -> None:
     assert patella is not None
     centre = tibia.points.mean(axis=0)
     assert (found["tibial crest"].position - centre) @ known.anterior > 5.0
-    assert (found["fibular head"].position - centre) @ known.medial < -10.0
+    assert (found["fibular head"].position - centre) @ known.medial_axis < -10.0
     near_end = np.linalg.norm(fibula.points - found["fibular head"].position, axis=1).min()
     assert near_end < 25.0
     assert abs(limb.height(found["fibular head"].position) - limb.height(fibula.points).max()) < 30.0
@@ -81,7 +81,7 @@ def test_regions_of_real_limbs(name: str) -> None:
 def test_a_side_that_the_fibula_contradicts_is_refused() -> None:
     limb = round_limb()
     found = find_directions(limb)
-    assert np.array_equal(find_directions(limb, "right").medial, found.medial)
+    assert np.array_equal(find_directions(limb, "right").medial_axis, found.medial_axis)
     with pytest.raises(SurfaceError, match=r'a right leg does, but socket.side is "left".*mirrored'):
         find_directions(limb, "left")
 

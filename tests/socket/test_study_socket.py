@@ -195,7 +195,7 @@ def test_tissues_of_people_are_taken_though_they_know_nothing_of_another_tissue(
     """Skin and muscle are people's; the band between them, and what nobody knows of any, starts as stated."""
     layers = '{ name = "skin", thickness_mm = 2 }, { name = "band", thickness_mm = 3 }'
     study = study_of(tmp_path, f"[geometry]\nlayers = [{layers}]\n")
-    people, start = of_tissues(("skin", "muscle")), study.material.of("band", "start")
+    people, start = of_tissues(("skin", "muscle")), study.material.get("band", "start")
     found, origin = choose_tissues(study, literature=True)
     assert origin == "literature"
     assert found["band"] == start

@@ -282,14 +282,14 @@ def decided(study: Study) -> dict[str, str]:
     """The key of every stage, and of the experiments that read more of a study."""
     known, stages = Keys(study), compute_keys(study)
     more = [e for e in EXPERIMENTS if e.name in ("uncertainty", "design")]
-    return stages | {e.name: known.of(e, stages, e.options).digest for e in more}
+    return stages | {e.name: known.compute_key(e, stages, e.options).digest for e in more}
 
 
 def decide(study: Study, name: str) -> str:
     """The key of one stage, without those below it where it reads the whole study, or of an experiment."""
     if name not in ("segment", "surfaces", "traces", "mesh"):
         return decided(study)[name]
-    return Keys(study).of(next(stage for stage in STAGES if stage.name == name), {}).digest
+    return Keys(study).compute_key(next(stage for stage in STAGES if stage.name == name), {}).digest
 
 
 @cache

@@ -118,7 +118,7 @@ def test_an_indenter_that_no_fitted_record_names_is_no_reason_to_identify_again(
     assert was["calibrate"] == decided(study)["calibrate"]
     studies = [loaded(folder, content) for content in (GIVEN, planned)]
     protocol = EXPERIMENTS["protocol"]
-    keys = [Keys(one).of(protocol, compute_keys(one), protocol.options).digest for one in studies]
+    keys = [Keys(one).compute_key(protocol, compute_keys(one), protocol.options).digest for one in studies]
     assert keys[0] != keys[1]
 
 
@@ -144,7 +144,7 @@ def test_the_design_of_a_socket_is_no_reason_to_put_it_on_again(folder: Path) ->
         study = loaded(folder, content)
         stages = compute_keys(study)
         chosen = [EXPERIMENTS[name] for name in ("socket", "socket_design")]
-        return [Keys(study).of(one, stages, one.options).digest for one in chosen]
+        return [Keys(study).compute_key(one, stages, one.options).digest for one in chosen]
 
     put_on, designed = of(GIVEN)
     other = of(changed(GIVEN, "socket.design.pressure_kPa", 12.0))

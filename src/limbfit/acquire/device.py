@@ -179,7 +179,7 @@ class LineDevice:
         self._answer_time_s = PACED_ANSWER_S if self.identity.is_paced else ANSWER_S
 
     @property
-    def refused(self) -> wire.Refusals:
+    def refusals(self) -> wire.Refusals:
         return self._decoder.refused
 
     def _greet(self) -> wire.Identity:
@@ -210,7 +210,7 @@ class LineDevice:
                 self._encoder = wire.Encoder(salt)
                 self._decoder.restart(salt)
                 return report
-            self.refused.unknown += 1
+            self.refusals.unknown += 1
         return None
 
     def send(self, command: wire.Command, now: float) -> None:
@@ -238,10 +238,10 @@ class LineDevice:
             report: wire.Report | None = wire.parse_report(line.body, line.number)
             match report:
                 case None | wire.Identity():
-                    self.refused.unknown += 1
-                case wire.Accepted(number=number):
+                    self.refusals.unknown += 1
+                case wire.Acceptance(number=number):
                     self._pending.pop(number, None)
-                case wire.Declined(number=number):
+                case wire.Rejection(number=number):
                     if self._pending.pop(number, None) is not None:
                         found.append(report)
                 case _:

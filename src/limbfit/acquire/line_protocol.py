@@ -310,27 +310,27 @@ class Identity(Message, verb="ID"):
         return self.clock == "paced"
 
 
-class Accepted(Message, verb="OK"):
+class Acceptance(Message, verb="OK"):
     """The command of this number is being done."""
 
     number: Number
 
 
-class Declined(Message, verb="NO"):
+class Rejection(Message, verb="NO"):
     """The command of this number is not done, and why, in a word."""
 
     number: Number
     code: Word
 
 
-class LimitTripped(Message, verb="FAULT"):
+class LimitTrip(Message, verb="FAULT"):
     """The device stopped by itself: why, in a word, and at which pin (0: none)."""
 
     code: Word
     pin: PinOrNone
 
 
-class OutOfReach(Message, verb="STUCK"):
+class StuckPins(Message, verb="STUCK"):
     """After a stop these pins (a bit each) do not come home."""
 
     pins: PinBits
@@ -338,8 +338,8 @@ class OutOfReach(Message, verb="STUCK"):
 
 Action = Move | Hold | Stop | Fence
 Command = Hello | SetLimits | NoteSite | NotePhase | Heartbeat | Bye | Action
-Notice = Sample | Declined | LimitTripped | OutOfReach  # what concerns a session
-Report = Identity | Accepted | Notice
+Notice = Sample | Rejection | LimitTrip | StuckPins  # what concerns a session
+Report = Identity | Acceptance | Notice
 _COMMANDS: dict[str, Any] = {kind.verb: kind for kind in get_args(Command)}
 _REPORTS: dict[str, Any] = {kind.verb: kind for kind in get_args(Report) if kind is not Sample}
 

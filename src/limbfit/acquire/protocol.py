@@ -38,27 +38,27 @@ class Abort:
 
 
 @dataclass(frozen=True, slots=True)
-class LinkLost:
+class LinkLoss:
     """Nothing will come from the device any more."""
 
     reason: str
 
 
-Event = Sample | Signal | Abort | LinkLost
+Event = Sample | Signal | Abort | LinkLoss
 
 
 class Settings(AcquireTable):
     """The study's table ``[acquire]``, and which pins hold the limb."""
 
     @property
-    def withdrawn(self) -> tuple[int, ...]:
+    def withdrawn_pins(self) -> tuple[int, ...]:
         """The two neighbours of the test pin, which stay off the skin so that it can bulge."""
         return tuple((self.pin - 1 + step) % PINS + 1 for step in (-1, 1))
 
     @property
     def clamps(self) -> tuple[int, ...]:
         """The pins that hold the limb."""
-        return tuple(pin for pin in range(1, PINS + 1) if pin != self.pin and pin not in self.withdrawn)
+        return tuple(pin for pin in range(1, PINS + 1) if pin != self.pin and pin not in self.withdrawn_pins)
 
 
 class Phase(StrEnum):
@@ -167,7 +167,7 @@ class Protocol:
                 return self._transition(Phase.POSITION, now)
             case Abort(reason=reason):
                 return self._stop(reason, now)
-            case LinkLost(reason=reason):
+            case LinkLoss(reason=reason):
                 self.reason = f"{self.reason}; {reason}" if self.reason else reason
                 if self.phase is not Phase.STOPPING:
                     self._transition(Phase.STOPPING, now)

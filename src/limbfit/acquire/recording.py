@@ -31,7 +31,7 @@ import numpy as np
 
 from ..arrays import Indices
 from ..errors import RunError, TraceError, add_location
-from ..traces import Regularised, Trace, find_touch_down, regularise
+from ..traces import RegularisedCurve, Trace, find_touch_down, regularise
 from .line_protocol import PERIOD_US, PINS, Sample
 
 FIRST_LINE = "#limbfit-recording 1"
@@ -352,7 +352,7 @@ def check_record(recording: Recording) -> Verdict:
 
 
 def _check_curves(counted: list[RecordedRamp], speed_mm_s: float) -> list[Check]:
-    smooth: list[Regularised] = []
+    smooth: list[RegularisedCurve] = []
     checks = []
     for ramp in counted:
         try:
@@ -366,7 +366,7 @@ def _check_curves(counted: list[RecordedRamp], speed_mm_s: float) -> list[Check]
     return [*checks, _check_repeatability(smooth)]
 
 
-def _check_speed(curve: Regularised, stated_mm_s: float) -> Check:
+def _check_speed(curve: RegularisedCurve, stated_mm_s: float) -> Check:
     low, high = stated_mm_s * (1.0 - SPEED_TOLERANCE), stated_mm_s * (1.0 + SPEED_TOLERANCE)
     speeds = (curve.speed_load_mm_s, curve.speed_unload_mm_s)
     found = f"{speeds[0]:.3f} mm/s in, {speeds[1]:.3f} mm/s out ({low:.3g} to {high:.3g})"
@@ -380,7 +380,7 @@ def _check_touch(place_mm: float, uncertainty_mm: float) -> Check:
     return Check("touch-down", uncertainty_mm <= MAX_TOUCH_SD_MM, found, remedy)
 
 
-def _check_repeatability(curves: list[Regularised]) -> Check:
+def _check_repeatability(curves: list[RegularisedCurve]) -> Check:
     if len(curves) < 2:
         return Check("repeatability", None, "one ramp: nothing to compare")
     depth = min(curve.depth_mm for curve in curves)

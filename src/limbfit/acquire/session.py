@@ -19,7 +19,7 @@ from ..errors import RunError
 from . import line_protocol as wire
 from .device import LineDevice
 from .line_protocol import PERIOD_US, Sample, to_thousandths
-from .protocol import Abort, Event, LinkLost, Phase, Protocol, Settings, Signal
+from .protocol import Abort, Event, LinkLoss, Phase, Protocol, Settings, Signal
 from .recording import Recorder
 
 SAMPLES_PER_LIVE_UPDATE = 20  # the listener gets 25 updates a second
@@ -123,17 +123,17 @@ class Session:
                 case Sample():
                     newest = report
                     self._handle_sample(report, now)
-                case wire.Declined(code=code):
+                case wire.Rejection(code=code):
                     self._record("declined", now, code=code)
                     if not self.protocol.is_over and self.protocol.phase is not Phase.STOPPING:
                         self.handle(Abort(f"the device declined a command: {code}{_explain_code(code)}"), now)
-                case wire.LimitTripped(code=code, pin=pin):
+                case wire.LimitTrip(code=code, pin=pin):
                     self._record("fault", now, code=code, pin=pin)
                     where = f", pin {pin}" if pin else ""
                     self.handle(
                         Abort(f"the device stopped by itself: {code}{where}{_explain_code(code)}"), now
                     )
-                case wire.OutOfReach(pins=pins):
+                case wire.StuckPins(pins=pins):
                     self.unreachable = tuple(k + 1 for k in range(pins.bit_length()) if pins >> k & 1)
                     self._record("unreachable", now, pins=list(self.unreachable))
         if newest is not None:
@@ -229,7 +229,7 @@ class Session:
         try:
             yield
         except RunError as error:
-            self.handle(LinkLost(str(error)), now)
+            self.handle(LinkLoss(str(error)), now)
 
 
 def prioritise() -> str:
@@ -275,7 +275,7 @@ def _run_loop(session: Session, operator: SimpleQueue[Event]) -> None:
         try:
             reports = device.receive(LOOP_TIMEOUT_S)
         except RunError as error:
-            session.handle(LinkLost(str(error)), now)
+            session.handle(LinkLoss(str(error)), now)
             return
         wall = time.monotonic()
         if not paced:
@@ -288,7 +288,7 @@ def _run_loop(session: Session, operator: SimpleQueue[Event]) -> None:
                 now = max(now, max(times) - origin)
             session.handle_reports(reports, now)
         elif paced and wall - heard > PACED_SILENCE_S:
-            session.handle(LinkLost(f"the device has been silent for {PACED_SILENCE_S:g} s"), now)
+            session.handle(LinkLoss(f"the device has been silent for {PACED_SILENCE_S:g} s"), now)
             return
         with suppress(Empty):
             while True:

@@ -57,10 +57,10 @@ class Grid:
     def __post_init__(self) -> None:
         for name in ("spacing", "origin", "direction"):
             object.__setattr__(self, name, np.array(getattr(self, name), dtype=float))
-        object.__setattr__(self, "array", self._as_array(self.array))
+        object.__setattr__(self, "array", self._to_array(self.array))
         self._check()
 
-    def _as_array(self, array: ArrayLike) -> NDArray[Any]:
+    def _to_array(self, array: ArrayLike) -> NDArray[Any]:
         return np.asarray(array)
 
     def _check(self) -> None:
@@ -205,7 +205,7 @@ class Volume(Grid):
     modality: str = ""
     notes: tuple[str, ...] = ()
 
-    def _as_array(self, array: ArrayLike) -> NDArray[Any]:
+    def _to_array(self, array: ArrayLike) -> NDArray[Any]:
         return np.asarray(array, dtype=np.float32)
 
     @classmethod
@@ -234,7 +234,7 @@ class LabelMap(Grid):
         if len(set(names.values())) < len(names):
             raise LabelError("two labels have the same name", remedy="give them different names")
 
-    def _as_array(self, array: ArrayLike) -> NDArray[Any]:
+    def _to_array(self, array: ArrayLike) -> NDArray[Any]:
         raw = np.asarray(array)
         if raw.dtype == np.uint8:
             return raw

@@ -98,7 +98,7 @@ def time_febio(program: Path, folder: Path, case: str, threads: int) -> float:
         table = file.with_suffix(".txt")
         end_s = float(read_log(table).times[-1])
         run = run_febio(program, Path(scratch), end_s, table.name, threads=threads)
-    if not run.verdict.completed:
+    if not run.verdict.is_completed:
         raise RunError(f"{file}: {run.verdict.reason}")
     return run.seconds
 

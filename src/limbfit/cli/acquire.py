@@ -34,7 +34,7 @@ from ..acquire import (
     prioritise,
 )
 from ..acquire.protocol import Abort
-from ..acquire.virtual import Serving, read_faults
+from ..acquire.virtual import Endpoint, read_faults
 from ..errors import InputError
 from .commands import StudyPath
 from .console import STDERR, AsJson, print_aside, print_json, print_line, print_result
@@ -181,7 +181,7 @@ def virtual_fitsocket(
     checked = limbfit.load_study(study, recorded=False)
     wrong = read_faults(faults) if faults is not None else ()
     device = limbfit.virtual_fitsocket(checked, seed=seed, faults=wrong, paced=speed > 1)
-    serving = Serving.on_terminal() if terminal else Serving.on_port(host, port)
+    serving = Endpoint.open_terminal() if terminal else Endpoint.listen_on_port(host, port)
     wakeup = signal.set_wakeup_fd(-1)
     for kind in (signal.SIGINT, signal.SIGTERM):
         signal.signal(kind, lambda number, frame: serving.stop())

@@ -65,9 +65,9 @@ def simulate_donning(
         found = compute_tractions(system, laws, step.state)
         rows.append(_build_row(step, found, patches))
         for name in fit.find_held(step.time):
-            pressure, shear = found.at_nodes(len(problem.mesh.points))
+            pressure, shear = found.average_at_nodes(len(problem.mesh.points))
             slopes = _compute_slopes(problem, system, laws, step.state, patches) if sensitivities else {}
-            strains = Strains.of(system, laws, step.state)
+            strains = Strains.from_state(system, laws, step.state)
             held[name] = LoadedState(rows[-1], pressure, shear, step.state.u, strains, slopes)
         if on_row is not None:
             on_row(rows[-1])
@@ -87,7 +87,7 @@ def simulate_donning(
 
 
 def _build_row(step: Step, found: Tractions, patches: Mapping[str, Mask]) -> SocketStep:
-    values = {name: Patch.of(found, mask) for name, mask in patches.items()}
+    values = {name: Patch.from_tractions(found, mask) for name, mask in patches.items()}
     return SocketStep(
         time=step.time,
         force=step.reactions[0, :3],
@@ -168,7 +168,7 @@ class Patch:
     shear_peak_kPa: float
 
     @classmethod
-    def of(cls, found: Tractions, chosen: Mask) -> Patch:
+    def from_tractions(cls, found: Tractions, chosen: Mask) -> Patch:
         """Over the chosen (f,) faces."""
         areas = found.areas.sum(axis=1)
         shear = np.linalg.norm(found.face_shear_kPa[chosen], axis=1)
@@ -219,7 +219,7 @@ class Strains:
     volume_mm3: Array
 
     @classmethod
-    def of(cls, system: System, laws: Laws, state: State) -> Self:
+    def from_state(cls, system: System, laws: Laws, state: State) -> Self:
         """Of a state that kept its memory."""
         fields = compute_element_fields(system, laws, state)
         most, _, least = fields.stretches.T**2
@@ -235,7 +235,7 @@ class Strains:
             "energy_density_kPa": self.energy_kPa,
         }
 
-    def within(self, cells: Mask) -> tuple[Facts, int]:
+    def summarise_cells(self, cells: Mask) -> tuple[Facts, int]:
         """The strain of a tissue with the chosen cells (m,), as it is stored, and the cell most sheared.
 
         The largest values are those of one cell, and grow as cells get smaller; ``_rare`` is what 1 % of the

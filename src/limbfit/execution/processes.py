@@ -164,11 +164,11 @@ class SerialExecutor(Executor):
         return count_usable_cores()
 
     def _run_jobs(self, batch: Batch) -> Iterator[Any]:
-        def done(job: Any) -> Any:
+        def do_job(job: Any) -> Any:
             with send_reports_to(None if batch.on_report is None else partial(batch.on_report, job)):
                 return batch.function(job)
 
-        return map(done, batch.jobs)
+        return map(do_job, batch.jobs)
 
 
 MAX_TRIES = 2

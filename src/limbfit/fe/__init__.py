@@ -12,8 +12,8 @@ from .contact.smooth_surface import SmoothSurface as SmoothSurface
 from .kernel.elements import ELEMENTS as ELEMENTS
 from .materials import ORDER_IN_TIME as ORDER_IN_TIME
 from .materials import VOLUMETRIC_LAWS as VOLUMETRIC_LAWS
-from .materials import Contractile as Contractile
-from .materials import Fibred as Fibred
+from .materials import ContractileMaterial as ContractileMaterial
+from .materials import FibredMaterial as FibredMaterial
 from .materials import FungQLV as FungQLV
 from .materials import Material as Material
 from .materials import MooneyRivlin as MooneyRivlin

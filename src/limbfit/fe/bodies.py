@@ -84,7 +84,7 @@ class _Body:
         if len(self.free):
             found = u[self.row : self.row + 2].ravel() / self.scale
             coordinates[self.free] = found[self.free]
-        pose = Pose(self.start.grown(growth), self.pivot, coordinates)
+        pose = Pose(self.start.grow(growth), self.pivot, coordinates)
         return Tool(self.surface, pose, u, self.free, self.row, self.unit)
 
 
@@ -144,7 +144,7 @@ class Bodies:
         self._corner = rows[~above] - start, columns[~above], places[~above]
 
     @property
-    def first(self) -> _Body:
+    def first_body(self) -> _Body:
         """The indenter, or the first body where there is none."""
         return self.all[0]
 
@@ -186,7 +186,7 @@ class Bodies:
         tools = self.tools(u, drives)
         for i, (body, tool) in enumerate(zip(self.all, tools)):
             at, grip = body.points, grips[i] if i < len(grips) else None
-            near = Distances.of(tool, None if grip is None else grip.held)
+            near = Distances.from_tool(tool, None if grip is None else grip.held)
             areas = body.surface.areas.ravel()
             weights[at] = penalty * areas
             found = contact(
@@ -203,8 +203,8 @@ class Bodies:
             if tangent and len(body.free):
                 units, columns = tool.units, body.columns
                 self.levers[at, :, columns] = tool.levers
-                turning[at, :, columns] = tool.pose.turning(forces[at], body.free) * units
-                bent = tool.pose.bending(places, forces[at][pushed], body.free)
+                turning[at, :, columns] = tool.pose.compute_turning(forces[at], body.free) * units
+                bent = tool.pose.compute_bending(places, forces[at][pushed], body.free)
                 moved = np.einsum("cij,cik->jk", self.levers[at, :, columns], turning[at, :, columns])
                 # Between moves and turns: lever of row times turning of column.
                 moved = np.where((body.free[:, None] < 3) & (body.free > 2), moved, 0.0)
@@ -262,7 +262,7 @@ class Bodies:
 
     def differentiate_advance(self, found: Contacts) -> Array:
         """Mixed derivative (r, 3) with respect to displacement and advance of the first body, times -1."""
-        body, axis = self.first, self.first.frame[2]
+        body, axis = self.first_body, self.first_body.frame[2]
         out = found.tools[0].distribute_forces((found.touch.blocks[body.points] @ axis)[..., None])[..., 0]
         if len(body.free):
             turned = np.zeros(6)
@@ -272,7 +272,7 @@ class Bodies:
 
     def project_on_axis(self, forces: Array) -> Array:
         """What forces (c, 3, p) on the points ask of the first body along its axis (p,), N."""
-        return -np.einsum("i,cip->p", self.first.frame[2], forces[self.first.points])
+        return -np.einsum("i,cip->p", self.first_body.frame[2], forces[self.first_body.points])
 
     def select_shares(self, unknowns: Index) -> sp.csr_matrix:
         """Shares (m, 3 c) of some unknowns in the contact points, for `spread_forces` and `move_springs`.
@@ -373,7 +373,7 @@ def _place_start(problem: Problem, stated: RigidBody, surface: ContactSurface) -
     if stated.shape is not problem.indenter or problem.start != "touching":
         return stated.shape
     offset = find_touching_offset(surface, stated.shape)
-    start = stated.shape.moved(offset)
+    start = stated.shape.move(offset)
     if abs(surface.gaps_at_rest(start).min()) > 1e-6:
         raise ProblemError(
             "the indenter never meets the contact faces", remedy="check its centre, axis and the faces"

@@ -108,10 +108,10 @@ def workspace(nodes: int, points: int, numbers: int) -> tuple[NDArray[Any], ...]
     """
     sizes = {POINT: points, LAW: 1, NUMBER: numbers, NODE: points * nodes, FORCE: nodes, ELEMENT: 1}
     sizes |= {BLOCK: nodes * (nodes + 1) // 2, RATE: points * numbers}
-    return tuple(_aligned(kind, count) for kind, count in sizes.items())
+    return tuple(_allocate_aligned(kind, count) for kind, count in sizes.items())
 
 
-def _aligned(kind: np.dtype[Any], count: int) -> NDArray[Any]:
+def _allocate_aligned(kind: np.dtype[Any], count: int) -> NDArray[Any]:
     """Zeroed records that begin with a cache line, so that no vector lies across two."""
     raw = np.zeros(kind.itemsize * count + 64, dtype=np.uint8)
     start = -raw.ctypes.data % 64
@@ -135,7 +135,7 @@ def address(function: Any, signature: Any) -> int:
     return int(made.library.get_pointer_to_function(made.fndesc.llvm_func_name))
 
 
-def _at_address(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+def _call_at_address(context: Any, builder: Any, signature: Any, values: Any) -> Any:
     """Call the function at the first of ``values`` with the others."""
     kinds = signature.args[1:]
     pointer = context.call_conv.get_function_type(types.void, kinds).as_pointer()
@@ -147,13 +147,13 @@ def _at_address(context: Any, builder: Any, signature: Any, values: Any) -> Any:
 @_inlined
 def call_with_two(context, where, point, numbers):  # type: ignore[no-untyped-def]
     """Call the function at an `address`; compiled code that does so need not be compiled for it."""
-    return types.void(types.int64, point, numbers), _at_address
+    return types.void(types.int64, point, numbers), _call_at_address
 
 
 @_inlined
 def call_with_three(context, where, point, numbers, rates):  # type: ignore[no-untyped-def]
     """`call_with_two`, with three arguments."""
-    return types.void(types.int64, point, numbers, rates), _at_address
+    return types.void(types.int64, point, numbers, rates), _call_at_address
 
 
 @_inlined

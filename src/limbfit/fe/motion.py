@@ -137,16 +137,16 @@ class Motion:
         its own."""
         i = min(max(int(np.searchsorted(self.times, t)) - 1, 0), len(self.times) - 2)
         share = np.clip((t - self.times[i]) / (self.times[i + 1] - self.times[i]), 0.0, 1.0)
-        start, end = self._driven[i : i + 2]
+        start, end = self._driven_values[i : i + 2]
         found = (1.0 - share) * start + share * end
         return found[:6], np.asarray(self.forced)[i], float(found[6])
 
     def moving_s(self, t: float) -> float:
         """For how long anything has changed up to time ``t``, s."""
-        return measure_moving_time(self.times, self._driven, t)
+        return measure_moving_time(self.times, self._driven_values, t)
 
     @property
-    def _driven(self) -> Array:
+    def _driven_values(self) -> Array:
         """(n, 7) the values, and the growth."""
         return np.column_stack([self.values, np.asarray(self.growth)])
 
@@ -155,7 +155,7 @@ class Motion:
         """Times between the ends at which a rate, or what drives a coordinate, changes, s."""
         steps = np.diff(self.times)
         kept = steps > 0.0
-        rates = np.diff(np.nan_to_num(self._driven), axis=0)[kept] / steps[kept, None]
+        rates = np.diff(np.nan_to_num(self._driven_values), axis=0)[kept] / steps[kept, None]
         forced = np.asarray(self.forced)[kept]
         size = np.abs(rates).max(axis=0, initial=0.0)
         changed = (np.abs(np.diff(rates, axis=0)) > 1e-9 * size).any(axis=1)
@@ -173,15 +173,15 @@ class Drives:
     growth: Array
 
     @classmethod
-    def of(cls, motions: Sequence[Motion], t: float) -> Drives:
+    def from_motions(cls, motions: Sequence[Motion], t: float) -> Drives:
         found = [motion.at(t) for motion in motions]
         values, forced = np.array([v for v, _, _ in found]), np.array([f for _, f, _ in found], dtype=bool)
         return cls(values.reshape(-1, 6), forced.reshape(-1, 6), np.array([g for _, _, g in found]))
 
     @classmethod
-    def none(cls) -> Drives:
+    def make_empty(cls) -> Drives:
         """Those of no body."""
-        return cls.of((), 0.0)
+        return cls.from_motions((), 0.0)
 
 
 @dataclass(frozen=True)
@@ -263,7 +263,7 @@ class Activation:
     Parameters
     ----------
     times : (n,) s, from 0.
-    shares : (n,) of the active stress of every `Contractile` tissue; 0 at rest, not negative.
+    shares : (n,) of the active stress of every `ContractileMaterial` tissue; 0 at rest, not negative.
     """
 
     times: Sequence[float] | Array

@@ -111,7 +111,7 @@ class PressedSurface:
         return sp.csr_matrix((blocks.ravel(), (r.ravel(), c.ravel())), shape=(3 * rows, 3 * rows))
 
     @cached_property
-    def upper(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    def upper_indices(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         """Upper triangle of a face's component-major matrix."""
         return np.triu_indices(3 * self.faces.shape[1])
 
@@ -119,7 +119,7 @@ class PressedSurface:
         """The upper triangles (f, .) of blocks (f, k, k, 3, 3), component by component."""
         k = self.faces.shape[1]
         whole = blocks.transpose(0, 3, 1, 4, 2).reshape(-1, 3 * k, 3 * k)
-        return np.asarray(whole[:, self.upper[0], self.upper[1]])
+        return np.asarray(whole[:, self.upper_indices[0], self.upper_indices[1]])
 
 
 class Pressures:
@@ -139,7 +139,7 @@ class Pressures:
     def evaluate(self, u: Array, values: Sequence[float], rims: Array | float) -> tuple[float, Array, float]:
         """Energy of the pressures ``values (k,)``, MPa, at ``u (r, 3)``, its derivative (r, 3), and the norm
         of the forces, N; ``rims (n, 3)`` as `compute_rims` gave them."""
-        x = self._at(u)
+        x = self._move_points(u)
         residual, total, energy = np.zeros_like(u), np.zeros_like(x), 0.0
         residual[: len(x)] += rims
         energy = float((residual * u).sum())
@@ -150,12 +150,12 @@ class Pressures:
             total += p * forces
         return energy, residual, float(np.linalg.norm(total))
 
-    def _at(self, u: Array) -> Array:
+    def _move_points(self, u: Array) -> Array:
         return self._points + u[: len(self._points)]
 
     def compute_rims(self, u: Array, values: Sequence[float]) -> Array:
         """Forces (n, 3) that the pressures have at ``u (r, 3)`` beyond the derivative of their energy, N."""
-        x, out = self._at(u), np.zeros_like(self._points)
+        x, out = self._move_points(u), np.zeros_like(self._points)
         for one, p in zip(self.all, values):
             _, gradient, forces = one.volume(x)
             out += p * (forces - gradient)
@@ -163,7 +163,7 @@ class Pressures:
 
     def add_tangent(self, u: Array, values: Sequence[float], data: Array) -> None:
         """Add the hessian of the energy to the entries ``data``."""
-        x = self._at(u)
+        x = self._move_points(u)
         for one, p, places in zip(self.all, values, self._positions):
             if p:
                 there = places >= 0
@@ -171,7 +171,7 @@ class Pressures:
 
     def coupling(self, u: Array, values: Sequence[float]) -> sp.csr_matrix:
         """Derivative (unknowns, unknowns) of what a step holds constant at the rims."""
-        x, numbers = self._at(u), self._pattern.numbers
+        x, numbers = self._move_points(u), self._pattern.numbers
         free = np.flatnonzero(numbers.ravel() >= 0)
         total = sp.csr_matrix((numbers.size, numbers.size))
         for one, p in zip(self.all, values):

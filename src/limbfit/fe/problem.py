@@ -148,8 +148,8 @@ class Problem:
     bodies : further rigid bodies, each driven by its own motion.
     pressures : on boundary faces, normal to them as they move.
     fibres : direction of the fibres at rest, one (3,) or one for each cell (m, 3), of any length; where a
-        material is `Fibred`.
-    activation : how much of the active stress of `Contractile` materials acts, over time.
+        material is `FibredMaterial`.
+    activation : how much of the active stress of `ContractileMaterial` materials acts, over time.
     start : ``touching`` moves the indenter along its axis until it just touches; ``as-given`` does not.
     prestretch : elastic deformation of the tissue where the mesh is, one (3, 3) or one for each cell (m, 3,
         3), such as `isochoric_stretch`; the body is in equilibrium with it, long since, before time begins.
@@ -198,7 +198,7 @@ class Problem:
 
     def drives(self, t: float) -> Drives:
         """What drives the rigid bodies at time ``t``."""
-        return Drives.of([body.motion for body in self.rigid_bodies], t)
+        return Drives.from_motions([body.motion for body in self.rigid_bodies], t)
 
     def take_over_forces(self, t: float, reactions: Array) -> Problem:
         """The problem with the ``reactions (b, 6)`` of the bodies as the forces left open at time ``t``."""

@@ -75,7 +75,7 @@ class State:
     memory: Memory | None = None
     coordinates: Array = field(default_factory=lambda: np.zeros((0, 3)))
     bodies: Array | None = None
-    drives: Drives = field(default_factory=Drives.none)
+    drives: Drives = field(default_factory=Drives.make_empty)
     grips: tuple[StickyContact | None, ...] = ()
     activation: float = 0.0
 

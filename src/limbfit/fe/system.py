@@ -55,7 +55,7 @@ class Increment:
     scale: Array
     history: Array
     penalty: float
-    drives: Drives = field(default_factory=Drives.none)
+    drives: Drives = field(default_factory=Drives.make_empty)
     grips: tuple[StickyContact | None, ...] = ()
     flat_from: float = np.inf
     pressures: tuple[float, ...] = ()
@@ -139,7 +139,7 @@ class System:
         """The problem's indenter where it starts."""
         if self.problem.indenter is None:
             return None
-        start = self.bodies.first.start
+        start = self.bodies.first_body.start
         assert isinstance(start, Indenter)
         return start
 

@@ -51,12 +51,12 @@ class Tractions:
     @cached_property
     def face_pressure_kPa(self) -> Array:
         """(f,) mean over each face, kPa."""
-        return self._over_faces(self.pressure_kPa[..., None])[:, 0]
+        return self._average_over_faces(self.pressure_kPa[..., None])[:, 0]
 
     @cached_property
     def face_shear_kPa(self) -> Array:
         """(f, 3) mean over each face, kPa."""
-        return self._over_faces(self.shear_kPa)
+        return self._average_over_faces(self.shear_kPa)
 
     @property
     def contact_area(self) -> float:
@@ -72,7 +72,7 @@ class Tractions:
         """(3,) on the tissue about a point (3,), N mm."""
         return np.asarray(np.cross(self.points - np.asarray(about), self.forces).sum(axis=(0, 1)))
 
-    def at_nodes(self, n: int) -> tuple[Array, Array]:
+    def average_at_nodes(self, n: int) -> tuple[Array, Array]:
         """Pressure (n,) and shear (n, 3), kPa, at the nodes of a mesh: the means of the faces around them, by
         their areas; 0 at nodes of none."""
         weights = np.repeat(self.areas.sum(axis=1), self.faces.shape[1])
@@ -84,7 +84,7 @@ class Tractions:
         means = sums / np.where(size > 0.0, size, 1.0)[:, None]
         return means[:, 0], means[:, 1:]
 
-    def _over_faces(self, values: Array) -> Array:
+    def _average_over_faces(self, values: Array) -> Array:
         return np.asarray(np.einsum("fq,fqi->fi", self.areas, values) / self.areas.sum(axis=1)[:, None])
 
 

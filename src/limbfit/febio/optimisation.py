@@ -62,7 +62,7 @@ def turn_to_indenter_frame(problem: Problem) -> Problem:
     for body in problem.bodies:
         shape = body.shape
         place = (np.asarray(shape.centre, dtype=float) - centre) @ frame.T
-        there = shape.placed(place, frame @ shape.frame[2], frame @ shape.frame[0])
+        there = shape.place(place, frame @ shape.frame[2], frame @ shape.frame[0])
         bodies.append(replace(body, shape=there, pivot=(body.origin - centre) @ frame.T))
     fibres = None if problem.fibres is None else np.asarray(problem.fibres, dtype=float) @ frame.T
     G = None if problem.prestretch is None else frame @ np.asarray(problem.prestretch, dtype=float) @ frame.T

@@ -179,8 +179,8 @@ def _find_covered_faces(problem: Problem) -> Indices:
         return faces
     if problem.start == "touching":
         surface = ContactSurface.build(problem.formulation, problem.mesh.points, faces, problem.contact_rule)
-        indenter = indenter.moved(find_touching_offset(surface, indenter))
-    deepest = indenter.moved(float(problem.history.driver.max()))
+        indenter = indenter.move(find_touching_offset(surface, indenter))
+    deepest = indenter.move(float(problem.history.driver.max()))
     middle = problem.mesh.points[faces[:, : 4 if faces.shape[1] == 4 else 3]].mean(axis=1)
     inside = deepest.signed_distance(middle) < 0.0
     return faces[inside] if inside.any() else faces

@@ -37,7 +37,7 @@ class Preparation:
         if problem.prestretch is None:
             return cls()
         times = [tau for law in problem.materials.values() for g, tau in law.table().prony if g != 0.0]
-        at_once = IndenterStart.of(problem).waits and not problem.touch_down_s
+        at_once = IndenterStart.from_problem(problem).waits and not problem.touch_down_s
         return cls(
             PRESTRAIN_S + RELAXATION_TIMES * float(max(times, default=0.0)), APPROACH_S if at_once else 0.0
         )
@@ -65,7 +65,7 @@ def prepare_problem(problem: Problem, steps: StepControl) -> tuple[Problem, tupl
     steps : step control with which limbfit finds where the indenter touches, and where bodies under a force
         are at the end of the first step.
     """
-    preparation, waits = Preparation.from_problem(problem), IndenterStart.of(problem).waits
+    preparation, waits = Preparation.from_problem(problem), IndenterStart.from_problem(problem).waits
     motions = [body.motion for body in problem.rigid_bodies]
     if not (waits or any(np.asarray(motion.forced)[0].any() for motion in motions)):
         return problem.delay(preparation.settling_s), tuple(m.delay(preparation.settling_s) for m in motions)
@@ -129,7 +129,7 @@ def _approach_tissue(problem: Problem, place: float, wait_s: float) -> Problem:
         across = np.column_stack([np.interp(times, history.times, values) for values in history.across.T])
     return replace(
         later,
-        indenter=start.moved(-clear),
+        indenter=start.move(-clear),
         start="as-given",
         history=History(times, ways, across),
         touch_down_s=0.0,

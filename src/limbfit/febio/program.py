@@ -90,7 +90,7 @@ def run_febio(
         log = read_log(folder / table)
     except ProblemError as error:
         log = None
-        if verdict.completed:
+        if verdict.is_completed:
             verdict = replace(verdict, kind="no output", reason=f"FEBio ended normally, but {error}")
     return FebioRun(verdict, log, seconds)
 
@@ -167,7 +167,7 @@ def build_result(problem: Problem, log: FebioLog | None, verdict: RunVerdict, se
         coordinates=np.full((len(times), 1, 6), np.nan),
         displacement_sensitivity=None,
         states=(),
-        completed=verdict.completed,
+        completed=verdict.is_completed,
         reason=verdict.reason,
         statistics={
             "steps": len(times) - 1,
@@ -212,7 +212,7 @@ class RunVerdict:
     version: str
 
     @property
-    def completed(self) -> bool:
+    def is_completed(self) -> bool:
         return self.kind == "normal"
 
 

@@ -69,7 +69,7 @@ def run_feb(
             raise InputError("is there already", file=table, remedy="give another folder with --output")
     last = control.times[-1]
 
-    def accepted(step: Step) -> None:
+    def accept_step(step: Step) -> None:
         tables.add(step)
         if weights is not None:
             weights.update_after(step)
@@ -79,7 +79,7 @@ def run_feb(
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tables:
-            result = solve(problem, control, on_step=accepted, store="peak", system=system)
+            result = solve(problem, control, on_step=accept_step, store="peak", system=system)
     except OSError as error:
         raise RunError(f"{folder}: {error.strerror or error}") from error
     return FebRun(result, tables.files, model.notes)

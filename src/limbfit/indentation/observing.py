@@ -167,7 +167,7 @@ def observe_result(result: Result, model: SiteModel, times_s: Array) -> tuple[Ar
     since_touch = np.arange(len(values)) < len(gauges)
     at = np.clip(np.append(model.waits_s, times_s), result.times[0], result.times[-1])
 
-    def between(of_states: Array) -> Array:
+    def interpolate_states(of_states: Array) -> Array:
         """What is (g, s, ...) in the states at the wanted times, (g, n, ...); lengths since touch-down."""
         kinks, steps = result.problem.kinks, result.times[: of_states.shape[1]]
         column = np.moveaxis(of_states, 1, 0)
@@ -175,7 +175,7 @@ def observe_result(result: Result, model: SiteModel, times_s: Array) -> tuple[Ar
         found[since_touch] -= found[since_touch, :1]
         return np.asarray(found[:, 1:])
 
-    return between(values), None if slopes is None else between(slopes)
+    return interpolate_states(values), None if slopes is None else interpolate_states(slopes)
 
 
 def _read_at_states(
@@ -261,11 +261,11 @@ class _Regions:
     way: Array
 
     @classmethod
-    def of(cls, result: Result, places: Sequence[WavePlace]) -> _Regions:
+    def from_result(cls, result: Result, places: Sequence[WavePlace]) -> _Regions:
         mesh, system = result.problem.mesh, result.system
         cells, local = zip(*(_locate_points(mesh, place) for place in places), strict=True)
         number = np.repeat(np.arange(len(places)), [len(own) for own in cells])
-        points = EvaluationPoints.at(
+        points = EvaluationPoints.from_cells(
             mesh,
             result.problem.formulation,
             np.concatenate(cells),
@@ -351,11 +351,11 @@ def compute_wave_speeds(result: Result, places: Sequence[WavePlace]) -> tuple[Ar
     The result must hold all of its states (``store="all"``).
     """
     problem, states = result.problem, result.states
-    regions = _Regions.of(result, places)
+    regions = _Regions.from_result(result, places)
     times = np.array([0.0, *(state.time for state in states)])
     seconds, turned = np.diff(times, prepend=0.0), _find_turns(result, times)
 
-    def after(materials: Mapping[str, Material], by: int = 0, step: float = 0.0) -> Array:
+    def find_speeds(materials: Mapping[str, Material], by: int = 0, step: float = 0.0) -> Array:
         """The speeds where parameter number ``by`` is larger by ``step``."""
         laws = Laws.build([materials[name] for name in problem.mesh.region_names])
         moved = [np.zeros((len(regions.nodes), 3))]
@@ -367,7 +367,7 @@ def compute_wave_speeds(result: Result, places: Sequence[WavePlace]) -> tuple[Ar
             moved.append(u)
         return regions.speeds(laws, moved, seconds, turned)
 
-    speeds = after(problem.materials)
+    speeds = find_speeds(problem.materials)
     if not states or states[0].sensitivity is None:
         return speeds, None
     slopes = []
@@ -377,7 +377,7 @@ def compute_wave_speeds(result: Result, places: Sequence[WavePlace]) -> tuple[Ar
         step = _DERIVATIVE_STEP * (abs(value) or 1.0)
         own = problem.materials[region]
         less, more = (
-            after({**problem.materials, region: own.with_parameters({name: value + change})}, p, change)
+            find_speeds({**problem.materials, region: own.with_parameters({name: value + change})}, p, change)
             for change in (-step, step)
         )
         slopes.append((more - less) / (2.0 * step))

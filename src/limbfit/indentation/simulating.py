@@ -46,12 +46,12 @@ class SimulationJob:
     nested_mm: float | None = None
 
     @property
-    def before(self) -> SimulationJob:
+    def guess_job(self) -> SimulationJob:
         """The job on the same mesh whose simulation gives the first guesses; there are ``starts``."""
         return replace(self, parameters=self.starts[-1], starts=self.starts[:-1], sensitivities=True)
 
     @property
-    def nested(self) -> SimulationJob | None:
+    def nested_job(self) -> SimulationJob | None:
         """The job on a part of the mesh whose simulation gives the first guesses, where there is one."""
         if self.nested_mm is None:
             return None
@@ -101,7 +101,7 @@ _PENETRATION_MARGIN = 0.5
 
 
 @dataclass
-class Prepared:
+class PreparedSite:
     """What a process keeps of a site for its next simulations.
 
     ``problem``, ``system`` and ``penalty`` (of contact, 1/mm; None: the solver's first) follow from the site
@@ -119,10 +119,10 @@ class Prepared:
 
 
 # By model, tissues and what the files of its extensions hold: a session may change those between two calls.
-_prepared: OrderedDict[tuple[SiteModel, tuple[str, ...], str], Prepared] = OrderedDict()
+_prepared: OrderedDict[tuple[SiteModel, tuple[str, ...], str], PreparedSite] = OrderedDict()
 
 
-def _prepare(model: SiteModel, tissues: tuple[str, ...]) -> Prepared:
+def _prepare(model: SiteModel, tissues: tuple[str, ...]) -> PreparedSite:
     """The site's discretisation and contact penalty; sites not used for longest are forgotten."""
     key = model, tissues, compute_extensions_digest(model.extensions)
     known = _prepared.get(key)
@@ -139,7 +139,7 @@ def _prepare(model: SiteModel, tissues: tuple[str, ...]) -> Prepared:
             allowed = _PENETRATION_MARGIN * control.penetration
             yielding = _estimate_yielding(near, tissues, key[-1])
             penalty = max(yielding / allowed, 2000.0 / model.indenter.width_mm)
-        known = _prepared[key] = Prepared(problem, system, penalty)
+        known = _prepared[key] = PreparedSite(problem, system, penalty)
     _prepared.move_to_end(key)
     most = count_stored_nodes(psutil.virtual_memory().total, count_usable_cores())
     while len(_prepared) > 1 and sum(len(one.problem.mesh.points) for one in _prepared.values()) > most:
@@ -208,14 +208,14 @@ def _solve_job(job: SimulationJob) -> Result:
     return found
 
 
-def _prepare_guesses(job: SimulationJob, known: Prepared) -> Result:
+def _prepare_guesses(job: SimulationJob, known: PreparedSite) -> Result:
     """The simulation that gives a job's first guesses, on its own mesh or carried on into it."""
-    if job.nested is None:
-        found = _solve_job(job.before)
-        if job.before.starts:
-            known.kept["of guesses"] = replace(job.before, times_s=()), found
+    if job.nested_job is None:
+        found = _solve_job(job.guess_job)
+        if job.guess_job.starts:
+            known.kept["of guesses"] = replace(job.guess_job, times_s=()), found
         return found
-    near = _solve_job(job.nested)
+    near = _solve_job(job.nested_job)
     radius, centre = job.nested_mm, np.array(job.model.position)
     if known.extension is None or known.extension[0] != radius:
         assert radius is not None

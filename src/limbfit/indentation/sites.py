@@ -34,8 +34,8 @@ from ..extensions import load_extensions
 from ..fe import (
     ELEMENTS,
     Activation,
-    Contractile,
-    Fibred,
+    ContractileMaterial,
+    FibredMaterial,
     FungQLV,
     History,
     Indenter,
@@ -204,8 +204,8 @@ def build_materials(
         ground = OgdenQLV(c, m, relaxation[::2], relaxation[1::2], kappa_ratio)
         found[tissue] = ground
         if fibre and tissue in fibred:
-            passive = Fibred(ground, **fibre)
-            found[tissue] = passive if active is None else Contractile(passive, active)
+            passive = FibredMaterial(ground, **fibre)
+            found[tissue] = passive if active is None else ContractileMaterial(passive, active)
     return found
 
 
@@ -370,7 +370,7 @@ def clamp_problem(problem: Problem, along: Array, clamps: ClampsTable) -> Proble
 
     Raises `ProblemError` as `build_clamping_pins`.
 
-    ``problem``: its indenter touches when they have pressed for `ClampsTable.begun_s`. ``along``: (3,) the
+    ``problem``: its indenter touches when they have pressed for `ClampsTable.lead_s`. ``along``: (3,) the
     limb's axis, proximally.
     """
     mesh, indenter = problem.mesh, problem.indenter
@@ -390,7 +390,7 @@ def _build_pin_body(problem: Problem, pin: Indenter, clamps: ClampsTable, name: 
     surface = ContactSurface.build(problem.formulation, mesh.points, skin[near], problem.contact_rule)
     times = [0.0, clamps.clamping_s, float(problem.history.times[-1])]
     motion = Motion.of(times, force={"z": [0.0, clamps.force_N, clamps.force_N]})
-    return RigidBody(pin.moved(find_touching_offset(surface, pin)), skin[near], motion, name=name)
+    return RigidBody(pin.move(find_touching_offset(surface, pin)), skin[near], motion, name=name)
 
 
 def _build_refusal(what: str) -> ProblemError:

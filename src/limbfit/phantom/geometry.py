@@ -204,7 +204,7 @@ def _compute_tibia(shape: Shank, points: Floats) -> Floats:
     section_z = np.minimum(z, shape.joint)
     depth = 3.5 + bevel + tuberosity
 
-    def blended(shaft: Floats, target: tuple[float, float]) -> Floats:
+    def blend(shaft: Floats, target: tuple[float, float]) -> Floats:
         return shaft[..., :2] + plateau[..., None] * (np.array(target, shaft.dtype) - shaft[..., :2])
 
     crest = compute_surface_point(
@@ -213,9 +213,9 @@ def _compute_tibia(shape: Shank, points: Floats) -> Floats:
     medial = compute_surface_point(shape, np.full_like(z, 0.92), section_z, shape.medial_depth + depth)
     lateral = 0.38 * compute_surface_point(shape, np.full_like(z, -0.25), np.maximum(section_z, shape.dome))
     corners = (
-        blended(crest, (0.0, -20.0)),
-        blended(medial, (23.0, 4.0)),
-        blended(lateral, (-21.0, 2.0)),
+        blend(crest, (0.0, -20.0)),
+        blend(medial, (23.0, 4.0)),
+        blend(lateral, (-21.0, 2.0)),
     )
     section = compute_triangle_distance(x, y, corners) - rounding
     return extrude_section(section, z, shape.pad, shape.joint - shape.joint_gap / 2, 4.0)
@@ -477,7 +477,7 @@ def extract_contour(field: Field, low: Corner, high: Corner, spacing: float) -> 
     poly = image.contour([0.0], scalars="field", method="flying_edges", compute_normals=False).clean()
     surface = find_bodies(from_pyvista(poly))[0]
     surface = _cap_rim(_project_to_surface(field, surface, high[2]), high[2])
-    return surface if surface.volume > 0 else surface.flipped
+    return surface if surface.volume > 0 else surface.flipped_surface
 
 
 def _project_to_surface(field: Field, surface: Surface, top: float) -> Surface:

@@ -155,7 +155,7 @@ class People:
 
     def choose_parameters(self, person: Person, study: Study) -> Parameters:
         """Parameters of a person's tissues: those drawn, the others as the study starts them."""
-        values = {tissue: dict(study.material.of(tissue, "start")) for tissue in study.tissues}
+        values = {tissue: dict(study.material.get(tissue, "start")) for tissue in study.tissues}
         for name, value in person.tissues.items():
             tissue, key = name.split(".")
             if key in values[tissue]:

@@ -59,7 +59,7 @@ class TrialStore:
         return self.trial.results / STORE
 
     @cached_property
-    def _common(self) -> str:
+    def _common_digest(self) -> str:
         """Digest of what decides everybody's answers."""
         trial, shapes = self.trial, self.trial.shapes
         tables = trial.model_dump(mode="json", include={"shapes", "tissues", "weight", "liner", "person"})
@@ -71,7 +71,7 @@ class TrialStore:
 
     def file(self, number: int, rule: RuleTable) -> Path:
         """Where the rows of a person with a rule are."""
-        digest = compute_digest(self._common, rule.model_dump(mode="json"))[:12]
+        digest = compute_digest(self._common_digest, rule.model_dump(mode="json"))[:12]
         return self.folder / f"{number:05d}-{digest}.parquet"
 
     def read(self, rules: Sequence[RuleTable] | None = None) -> Any:

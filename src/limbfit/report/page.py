@@ -44,7 +44,7 @@ class Figure:
 
 
 @dataclass(frozen=True)
-class Interactive:
+class InteractiveFigure:
     """A figure that a script makes: ``what`` names how, ``content`` is its data, ``label`` what it shows."""
 
     kind: ClassVar[str] = "interactive"
@@ -87,7 +87,7 @@ class Table:
     folded: bool = False
 
 
-Block = Prose | Note | Bullets | Figure | Interactive | Table
+Block = Prose | Note | Bullets | Figure | InteractiveFigure | Table
 
 
 @dataclass(frozen=True)

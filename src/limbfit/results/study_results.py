@@ -25,7 +25,7 @@ class HasResults(Protocol):
     def results(self) -> Path: ...
 
 
-class Single(cached_property[R]):
+class OneFile(cached_property[R]):
     """An attribute of `StudyResults` that has one file."""
 
     def __init__(self, model: type[R]) -> None:
@@ -33,7 +33,7 @@ class Single(cached_property[R]):
         self.model = model
 
 
-class Each(cached_property[dict[str, R]]):
+class ManyFiles(cached_property[dict[str, R]]):
     """An attribute of `StudyResults` that has a file for each site or stage: a dictionary by their names."""
 
     def __init__(self, model: type[R]) -> None:
@@ -48,33 +48,33 @@ class StudyResults:
     with several files (``stages``, ``simulate``, ``compare``) are dictionaries by stage or site.
     """
 
-    run = Single(RunResult)
-    stages = Each(StageStamp)
-    segment = Single(SegmentResult)
-    quality = Single(QualityResult)
-    surfaces = Single(SurfacesResult)
-    sites = Single(SitesResult)
-    traces = Single(TracesResult)
-    mesh = Single(MeshResult)
-    calibration = Single(CalibrationResult)
-    predict = Single(PredictResult)
-    uncertainty = Single(UncertaintyResult)
-    crossvalidate = Single(CrossvalidateResult)
-    regions = Single(RegionsResult)
-    sensitivity_c = Single(variants.StiffnessResult)
-    sensitivity_kappa = Single(variants.VolumeResult)
-    sensitivity_contact = Single(variants.FrictionResult)
-    sensitivity_indenter = Single(variants.IndenterResult)
-    sensitivity_mesh = Single(variants.RefinementResult)
-    cube = Single(variants.CubeResult)
-    models = Single(ModelsResult)
-    models_socket = Single(SocketOfModels)
-    socket = Single(SocketResult)
-    socket_design = Single(SocketDesignResult)
-    design = Single(DesignResult)
-    protocol = Single(ProtocolResult)
-    simulate = Each(SimulateResult)
-    compare = Each(CompareResult)
+    run = OneFile(RunResult)
+    stages = ManyFiles(StageStamp)
+    segment = OneFile(SegmentResult)
+    quality = OneFile(QualityResult)
+    surfaces = OneFile(SurfacesResult)
+    sites = OneFile(SitesResult)
+    traces = OneFile(TracesResult)
+    mesh = OneFile(MeshResult)
+    calibration = OneFile(CalibrationResult)
+    predict = OneFile(PredictResult)
+    uncertainty = OneFile(UncertaintyResult)
+    crossvalidate = OneFile(CrossvalidateResult)
+    regions = OneFile(RegionsResult)
+    sensitivity_c = OneFile(variants.StiffnessResult)
+    sensitivity_kappa = OneFile(variants.VolumeResult)
+    sensitivity_contact = OneFile(variants.FrictionResult)
+    sensitivity_indenter = OneFile(variants.IndenterResult)
+    sensitivity_mesh = OneFile(variants.RefinementResult)
+    cube = OneFile(variants.CubeResult)
+    models = OneFile(ModelsResult)
+    models_socket = OneFile(SocketOfModels)
+    socket = OneFile(SocketResult)
+    socket_design = OneFile(SocketDesignResult)
+    design = OneFile(DesignResult)
+    protocol = OneFile(ProtocolResult)
+    simulate = ManyFiles(SimulateResult)
+    compare = ManyFiles(CompareResult)
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -95,7 +95,7 @@ class StudyResults:
 
 
 MODELS: dict[str, type[StoredResult]] = {  # of each stored result, by its attribute
-    name: kind.model for name, kind in vars(StudyResults).items() if isinstance(kind, Single | Each)
+    name: kind.model for name, kind in vars(StudyResults).items() if isinstance(kind, OneFile | ManyFiles)
 }
 
 

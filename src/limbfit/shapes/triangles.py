@@ -111,7 +111,7 @@ def _box_distance(box, x):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _on_triangle(a, b, c, x, point):  # type: ignore[no-untyped-def]
+def _find_on_triangle(a, b, c, x, point):  # type: ignore[no-untyped-def]
     """Fill ``point`` with the closest point of a triangle and return its feature (Ericson 2005, 5.1.5)."""
     d1 = d2 = d3 = d4 = d5 = d6 = 0.0
     for i in range(3):
@@ -168,7 +168,7 @@ def closest_point(corners, tree, x, point, within=np.inf):  # type: ignore[no-un
             continue
         for p in range(-1 - links[k, 0], links[k, 1]):
             f = order[p]
-            kind = _on_triangle(corners[f, 0], corners[f, 1], corners[f, 2], x, trial)
+            kind = _find_on_triangle(corners[f, 0], corners[f, 1], corners[f, 2], x, trial)
             distance = 0.0
             for i in range(3):
                 distance += (x[i] - trial[i]) ** 2

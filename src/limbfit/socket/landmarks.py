@@ -41,7 +41,7 @@ class Directions:
     lateral: Array | None
 
     @property
-    def medial(self) -> Array:
+    def medial_axis(self) -> Array:
         """Towards the other leg. Raises `SurfaceError` where the side of the limb is not known."""
         if self.lateral is None:
             raise SurfaceError(
@@ -284,14 +284,14 @@ class StandardLoad:
         """(3,) N, LPS, on the socket."""
         force = self.proximal * directions.proximal + self.anterior * directions.anterior
         if self.medial:
-            force = force + self.medial * directions.medial
+            force = force + self.medial * directions.medial_axis
         return np.asarray(body_weight * force)
 
     def moment(self, body_weight: float, directions: Directions) -> Array:
         """(3,) N mm, LPS, on the socket about the knee centre."""
         arm = self.ahead_mm * directions.anterior
         if self.inside_mm:
-            arm = arm + self.inside_mm * directions.medial
+            arm = arm + self.inside_mm * directions.medial_axis
         return np.cross(arm, self.force(body_weight, directions))
 
 

@@ -54,7 +54,7 @@ class Rays:
     top: float
 
     @property
-    def lowest(self) -> float:
+    def bottom(self) -> float:
         """The station of the distal pole."""
         return -0.5 * np.pi * self.end_radius
 
@@ -108,11 +108,11 @@ class LimbProfile:
     radius: Array
     folds: Array
 
-    def at(self, angle: Array, station: Array) -> Array:
+    def find_radius(self, angle: Array, station: Array) -> Array:
         """Radii (...) at angles and stations, mm; those beyond the last station are the last one's."""
-        return self.interpolated(self.radius)(angle, station)
+        return self.interpolate_field(self.radius)(angle, station)
 
-    def interpolated(self, field: Array) -> Callable[[Array, Array], Array]:
+    def interpolate_field(self, field: Array) -> Callable[[Array, Array], Array]:
         """A field (k, ANGLES) as a function of angle and station."""
         angles = np.append(self.angles, np.pi)
         grid = RegularGridInterpolator((self.stations, angles), np.column_stack([field, field[:, 0]]))
@@ -133,7 +133,7 @@ def compute_profile(outer: Surface, frame: Frame) -> LimbProfile:
     local = Surface(frame.to_limb(outer.points), outer.faces)
     rays = _build_rays(local)
     top = -BELOW_CUT_MM - rays.centre_z
-    below = np.linspace(rays.lowest, 0.0, max(8, round(-rays.lowest / STEP_MM)), endpoint=False)
+    below = np.linspace(rays.bottom, 0.0, max(8, round(-rays.bottom / STEP_MM)), endpoint=False)
     stations = np.concatenate([below, np.linspace(0.0, top, max(8, round(top / STEP_MM)))])
     angles = -np.pi + 2 * np.pi * np.arange(ANGLES) / ANGLES
     radius, folds = compute_radii(local, rays, stations, angles)
@@ -211,7 +211,7 @@ class Offsets:
     def moves(self, points: Array) -> Array:
         """Moves (n, 3) of points (n, 3) of the limb frame, along their rays."""
         angle, station, _ = self.limb.rays.coordinates(points)
-        size = self.limb.interpolated(self.radial)(angle, station)
+        size = self.limb.interpolate_field(self.radial)(angle, station)
         return np.asarray(size[:, None] * self.limb.rays.direction(angle, station))
 
 
@@ -247,7 +247,7 @@ def apply_clearance(points: Array, faces: Indices, limb: LimbProfile, outer: Sur
     edges = find_half_edges(faces)
     both = np.vstack([edges, edges[:, ::-1]])
     neighbours = csr_array((np.ones(len(both)), (both[:, 0], both[:, 1])), shape=(len(points), len(points)))
-    radius = np.maximum(radius, limb.at(angle, station) + TARGET_MM)
+    radius = np.maximum(radius, limb.find_radius(angle, station) + TARGET_MM)
     for _ in range(MAX_ROUNDS):
         moved = limb.rays.points(angle, station, radius)
         need = _compute_moves(moved, faces, local)

@@ -69,14 +69,14 @@ def _build_socket(surface: Surface, outer: Surface, frame: Frame, bones: Mapping
     _check_place(face, limb.rays, limb.stations[-1])
     if not len(open_loops(face)):
         if face.volume < 0.0:
-            face = face.flipped
+            face = face.flipped_surface
             notes.append("its triangles looked into its wall and were turned")
         face, thick = _select_inner_face(face, limb.rays)
         notes.append(f"the inner face of a wall of about {thick:.1f} mm is taken")
     brim, open_distal = _find_brim(face, limb.rays)
     side = _compute_facing(face, limb.rays)
     if side > 0.0:
-        face = face.flipped
+        face = face.flipped_surface
         brim = brim[::-1]
         notes.append("its triangles looked away from the tissue and were turned")
     crossing = face.self_intersections
@@ -120,10 +120,10 @@ def _keep_largest_piece(surface: Surface) -> tuple[Surface, list[str]]:
 def _check_place(face: Surface, rays: Rays, top: float) -> None:
     """Refuse what is not around the limb's middle line, or lies beside it."""
     middle = face.points.mean(axis=0)
-    axis = rays.middle(np.clip(middle[2] - rays.centre_z, rays.lowest, top))
+    axis = rays.middle(np.clip(middle[2] - rays.centre_z, rays.bottom, top))
     apart = np.hypot(*(middle - axis)[:2])
     radius = float(np.median(np.linalg.norm((face.points - middle)[:, :2], axis=1)))
-    beyond = max(middle[2] - rays.centre_z - top, rays.lowest + rays.centre_z - middle[2], 0.0)
+    beyond = max(middle[2] - rays.centre_z - top, rays.bottom + rays.centre_z - middle[2], 0.0)
     if apart > radius or beyond > 0.0:
         raise SurfaceError(
             f"the socket does not surround the limb: its middle is {max(apart, beyond):.0f} mm off",

@@ -65,7 +65,7 @@ class TrimmedLimb:
     length: Array
     brim_station: Array
 
-    def along(self, way: Array) -> Array:
+    def find_points(self, way: Array) -> Array:
         """(angles, 3) the point of each meridian this far (angles,) from the pole."""
         rows = np.arange(len(way))
         after = np.clip((self.ways < way[:, None]).sum(axis=1), 1, self.ways.shape[1] - 1)
@@ -75,7 +75,7 @@ class TrimmedLimb:
 
     def tangent(self, way: Array, reach: float = 3.0) -> Array:
         """(angles, 3) unit vectors along the meridians, towards the brim, over some mm."""
-        step = self.along(way + reach) - self.along(way - reach)
+        step = self.find_points(way + reach) - self.find_points(way - reach)
         return np.asarray(step / np.linalg.norm(step, axis=1, keepdims=True))
 
 
@@ -118,13 +118,13 @@ def find_brim(limb: LimbProfile, frame: Frame, trim: Trim, count: int) -> Array:
     Errors are those of `trim_limb`.
     """
     trimmed = trim_limb(limb, frame, trim)
-    return frame.to_patient(trimmed.along(trimmed.length)[np.arange(count) * len(limb.angles) // count])
+    return frame.to_patient(trimmed.find_points(trimmed.length)[np.arange(count) * len(limb.angles) // count])
 
 
 def wrap_trimline(limb: LimbProfile, frame: Frame, points: Array) -> Array:
     """Put points (k, 3), such as those of a trimline, on the limb along their rays, LPS mm."""
     angle, station, _ = limb.rays.coordinates(frame.to_limb(points))
-    return frame.to_patient(limb.rays.points(angle, station, limb.at(angle, station)))
+    return frame.to_patient(limb.rays.points(angle, station, limb.find_radius(angle, station)))
 
 
 def _measure_above_trimline(
@@ -150,7 +150,7 @@ def _interpolate_line(points: Array, limb: LimbProfile) -> PchipInterpolator:
     if np.array_equal(points[0], points[-1]):  # some state the end of a closed line, too
         points = points[:-1]
     angle, station, radius = limb.rays.coordinates(points)
-    off = np.abs(radius - limb.at(angle, station))
+    off = np.abs(radius - limb.find_radius(angle, station))
     if off.max() > MAX_OFF_LIMB_MM:
         raise SurfaceError(
             f"point {int(off.argmax()) + 1} of the trimline lies {off.max():.0f} mm off the limb",
@@ -275,7 +275,7 @@ def _draw_surface(lines: TrimmedLimb, recipe: Recipe) -> SocketSurface:
     rings, at = [lines.meridians[0, :1]], [np.zeros(1)]
     below, up = [np.array([lengths.mean()])], [np.zeros((1, 3))]
     for number, way in enumerate(shares):
-        dense = lines.along(way)
+        dense = lines.find_points(way)
         count = max(MIN_RING_POINTS, round(_close_ring(dense)[1][-1] / recipe.edge_mm))
         points, where = _resample_ring(dense, count, 0.5 * (number % 2))
         rings.append(points)

@@ -43,14 +43,14 @@ class Socket:
         return Surface(self.points, self.faces)
 
     @cached_property
-    def closed(self) -> Surface:
+    def closed_surface(self) -> Surface:
         """The space inside as a closed surface, outward; each opening is closed by a fan."""
-        return close_by_fans(self.surface.flipped)
+        return close_by_fans(self.surface.flipped_surface)
 
     @property
     def volume_mm3(self) -> float:
         """The volume up to the brim."""
-        return self.closed.volume
+        return self.closed_surface.volume
 
     def find_covered(self, points: Array) -> Mask:
         """True (n,) for points (n, 3) that the face reaches: what of it is nearest is at no open edge."""
@@ -85,11 +85,11 @@ def cut_section(surface: Surface, point: ArrayLike, normal: ArrayLike) -> Array:
     rows = np.arange(len(faces))
     a, b, c = (faces[rows, (alone + turn) % 3] for turn in range(3))
 
-    def crossing(start: Indices, end: Indices) -> Array:
+    def find_crossings(start: Indices, end: Indices) -> Array:
         share = height[start] / (height[start] - height[end])
         return surface.points[start] + share[:, None] * (surface.points[end] - surface.points[start])
 
-    first, second = crossing(a, b), crossing(a, c)
+    first, second = find_crossings(a, b), find_crossings(a, c)
     turned = (height[a] > 0.0)[:, None]
     return np.stack([np.where(turned, first, second), np.where(turned, second, first)], axis=1)
 
@@ -123,7 +123,7 @@ def refuse_bones(
     spare_mm : how far a bone may do so besides roughness: a liner that the face was drawn without.
     """
     face = Surface(frame.to_limb(face.points), face.faces)
-    closed = close_by_fans(face.flipped)
+    closed = close_by_fans(face.flipped_surface)
     lowest = float(face.points[brim, 2].min())
     ends = [face.points[loop, 2].max() for loop in open_loops(face) if loop[0] not in brim]
     for name, bone in bones.items():

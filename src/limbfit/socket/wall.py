@@ -48,7 +48,7 @@ def build_wall(
         return _to_surface(shell)
     axis = np.asarray(axis, dtype=float) / np.linalg.norm(axis)
     block = _build_adapter(socket, axis, adapter_diameter_mm, max(adapter_mm, thickness_mm))
-    cavity = _to_manifold(socket.closed, "cavity")
+    cavity = _to_manifold(socket.closed_surface, "cavity")
     return _to_surface((shell + (block - cavity)).set_tolerance(SLIVER_MM))
 
 

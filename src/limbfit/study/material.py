@@ -67,7 +67,7 @@ class MaterialTable(TissueRange):
         """The parameters of the law."""
         return LAWS[self.law].keys
 
-    def of(self, tissue: str, which: End) -> dict[str, float]:
+    def get(self, tissue: str, which: End) -> dict[str, float]:
         """Start, lower or upper bound of the parameters of a tissue."""
         return getattr(self, which) | getattr(self.tissues.get(tissue, TissueRange()), which)
 
@@ -104,7 +104,7 @@ class MaterialTable(TissueRange):
 
     def check_keys(self) -> None:
         for tissue in ("", *self.tissues):
-            lower, start, upper = (self.of(tissue, which) for which in _ENDS)
+            lower, start, upper = (self.get(tissue, which) for which in _ENDS)
             place = f"tissues.{tissue}." if tissue else ""
             for which, values in zip(_ENDS, (lower, start, upper), strict=True):
                 for name in values.keys() - self.keys:
@@ -128,8 +128,8 @@ class MaterialTable(TissueRange):
                 what = f"material.prestretch.{tissue}: no layer, and no tissue with fibres"
                 raise ValueError(f"{what}; those are {', '.join(stretched)}")
         for name in self.keys:
-            lower = max(self.of(tissue, "lower")[name] for tissue in tissues)
-            upper = min(self.of(tissue, "upper")[name] for tissue in tissues)
+            lower = max(self.get(tissue, "lower")[name] for tissue in tissues)
+            upper = min(self.get(tissue, "upper")[name] for tissue in tissues)
             if not lower < upper:
                 what = f"material: the tissues' bounds of {name} have no range in common"
                 raise ValueError(f"{what}, and the stage of one material needs one; widen them")

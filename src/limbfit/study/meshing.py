@@ -57,16 +57,16 @@ def replace_edges(mesh: Any, widths_mm: Sequence[float] = (REFERENCE_WIDTH_MM,))
         return mesh
     narrow, wide = (min(1.0, width / REFERENCE_WIDTH_MM) for width in (min(widths_mm), max(widths_mm)))
 
-    def suited(edges: Mapping[str, float]) -> dict[str, float]:
+    def scale_edges(edges: Mapping[str, float]) -> dict[str, float]:
         near, radius = narrow * edges["edge_near_mm"], wide * edges["near_radius_mm"]
         return {**edges, "edge_near_mm": round(near, 3), "near_radius_mm": round(radius, 3)}
 
     fine, second = ACCURACIES.get(str(mesh.get("accuracy", "standard")), ACCURACIES["standard"])
-    coarse = None if second is None else suited(second)
+    coarse = None if second is None else scale_edges(second)
     near = mesh.get("edge_near_mm", 0.0)
     if coarse and isinstance(near, int | float) and near >= coarse["edge_near_mm"]:
         coarse = None  # it would be no coarser
-    return {**suited(fine), "coarse": coarse, **mesh}
+    return {**scale_edges(fine), "coarse": coarse, **mesh}
 
 
 class EdgesTable(TomlTable):

@@ -478,6 +478,6 @@ class ClampsTable(TomlTable):
         return self.angles_degrees or usual
 
     @property
-    def begun_s(self) -> float:
+    def lead_s(self) -> float:
         """When the indenter touches, after clamping began, s."""
         return self.clamping_s + self.settling_s

@@ -15,12 +15,12 @@ Units: s, mm, N; force positive when pushing, displacement positive into the lim
 
 from .interpretation import InterpretedRecord, interpret_record
 from .record import COLUMNS, Trace, TraceWarning, check_trace, read_trace
-from .regularise import Creep, Regularised, regularise, regularise_creep
+from .regularise import Creep, RegularisedCurve, regularise, regularise_creep
 from .secondary_measurements import (
     Layers,
+    LayerThinning,
     SurfaceMeans,
     SurfaceMotion,
-    Thinning,
     WaveMeans,
     WaveSpeeds,
     compute_thinnings,

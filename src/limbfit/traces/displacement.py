@@ -145,17 +145,17 @@ def _project_on_hats(hats: Array, u: Array) -> Array:
 def _place_knots(t: Array, u: Array, knots: Array) -> tuple[Array, Array]:
     """Least-squares corner times and values of a continuous broken line through (t, u)."""
 
-    def whole(inner: Array) -> Array:
+    def join_ends(inner: Array) -> Array:
         return np.r_[knots[0], inner, knots[-1]]
 
     def misfit(inner: Array) -> Array:
-        values, hats = _fit_values(t, u, whole(inner))
+        values, hats = _fit_values(t, u, join_ends(inner))
         return hats @ values - u
 
     def slopes(inner: Array) -> Array:
         """A corner that moves takes its hat along, at the speed on either side; the values follow (variable
         projection, Kaufman 1975)."""
-        corners = whole(inner)
+        corners = join_ends(inner)
         values, hats = _fit_values(t, u, corners)
         piece = np.clip(np.searchsorted(corners, t) - 1, 0, len(corners) - 2)
         speed = (np.diff(values) / np.diff(corners))[piece]
@@ -170,4 +170,4 @@ def _place_knots(t: Array, u: Array, knots: Array) -> tuple[Array, Array]:
         upper = np.r_[middle[1:-1] - margin[1:-1], knots[-1] - margin[-1]]
         found = least_squares(misfit, inner, jac=slopes, bounds=(lower, upper), x_scale=np.ptp(knots))
         inner = found.x
-    return whole(inner), _fit_values(t, u, whole(inner))[0]
+    return join_ends(inner), _fit_values(t, u, join_ends(inner))[0]

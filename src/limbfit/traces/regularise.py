@@ -33,7 +33,7 @@ END_SHARE = 0.05  # of the largest force: an indenter that hardly pushes may be 
 
 
 @dataclass(frozen=True)
-class Regularised:
+class RegularisedCurve:
     """Curves from touch-down: (n,) arrays that start at time 0, displacement 0, force 0.
 
     ``knots_s`` and ``knots_mm`` are the corners of the displacement; ``phases`` what it does, from touch-down
@@ -96,7 +96,7 @@ class Regularised:
 
 def regularise(
     trace: Trace, touch_down: TouchDown, smoothing: float | None = None, peak_s: float | None = None
-) -> Regularised:
+) -> RegularisedCurve:
     """The record as smooth curves counted from touch-down.
 
     ``smoothing`` is the penalty on the squared second derivative of force, s^3 (``lam`` of
@@ -116,7 +116,7 @@ def regularise(
     curve = SmoothCurve(trace.time_s - start, force, phases, smoothing)
     inside = (trace.time_s >= start) & (trace.time_s <= end)
     time = spread(phases, 1000, knots - start)
-    return Regularised(
+    return RegularisedCurve(
         time_s=time,
         displacement_mm=np.interp(time, knots - start, knots_mm),
         force_N=np.maximum(curve(time), 0.0),  # a dry indenter cannot pull
@@ -264,7 +264,7 @@ def _choose_penalty(x: Array, y: Array, w: Array) -> float:
 
 
 @dataclass(frozen=True)
-class Creep(Regularised):
+class Creep(RegularisedCurve):
     """Curves from touch-down under a stated force; they end where it falls below 5 % of its largest.
 
     ``knots_s`` and ``knots_N`` are the corners of the force, ``knots_mm`` the displacement there; ``phases``

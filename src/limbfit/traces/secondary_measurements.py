@@ -41,7 +41,7 @@ class Layers:
 
 
 @dataclass(frozen=True)
-class Thinning:
+class LayerThinning:
     """How much thinner a tissue is than at rest, from touch-down on.
 
     ``time_s``, ``compression_mm`` (n,) are means of ``samples`` (n,) readings each, whose standard deviation
@@ -106,7 +106,7 @@ def _check_range(values: Array, name: str, limits: tuple[float, float], wrong: s
 
 def compute_thinnings(
     layers: Layers, touch_down_s: float, end_s: float, sd_mm: float
-) -> tuple[Thinning, ...]:
+) -> tuple[LayerThinning, ...]:
     """Compute how each tissue gives way between touch-down and ``end_s``, times of the record.
 
     The thickness at rest is the mean of all readings before touch-down. Raises `TraceError` where there is
@@ -131,7 +131,7 @@ def compute_thinnings(
     for tissue, values in layers.thickness_mm.items():
         rest = float(values[before].mean())
         lost = rest - np.array([values[part].mean() for part in parts])
-        found.append(Thinning(tissue, rest, time, lost, samples, int(before.sum()), sd_mm))
+        found.append(LayerThinning(tissue, rest, time, lost, samples, int(before.sum()), sd_mm))
     return tuple(found)
 
 

@@ -71,7 +71,7 @@ def test_a_law_keeps_what_is_stated_of_the_parameters_that_it_has(tmp_path):
     derived = derive_study(study_of(tmp_path / "s"), FUNG)
     assert derived.law.name == FUNG
     assert derived.material.start["b"] == LAWS[FUNG].parameters[1].start
-    assert derived.material.of("skin", "upper") == {"c_kPa": 30.0, "b": 20.0, "gamma": 10.0, "tau_s": 5.0}
+    assert derived.material.get("skin", "upper") == {"c_kPa": 30.0, "b": 20.0, "gamma": 10.0, "tau_s": 5.0}
     assert derived.fixed == ("skin.tau_s",)
     assert derived.calibration.tied == (("skin.gamma", "muscle.gamma"), ("skin.c_kPa", "muscle.c_kPa"))
     two = derive_study(study_of(tmp_path / "t"), "two-terms")

@@ -8,7 +8,7 @@ import pytest
 from guide import identified
 from layered import block_context, block_study
 from limbfit.errors import InputError, StudyError
-from limbfit.fe import Fibred, OgdenQLV
+from limbfit.fe import FibredMaterial, OgdenQLV
 from limbfit.indentation import SimulationJob, build_materials, build_problem, simulate
 from limbfit.mesh import read_vtu
 from limbfit.pipeline.commands.run import compute_keys
@@ -39,7 +39,7 @@ def test_the_core_has_fibres_along_the_limb_and_no_other_tissue(tmp_path):
     assert study.fixed == ("skin.k1_kPa", "skin.k2")
     made = build_materials(TRUTH, 100.0, study.law.name, study.fibres)
     assert isinstance(made["skin"], OgdenQLV)
-    assert isinstance(made["muscle"], Fibred)
+    assert isinstance(made["muscle"], FibredMaterial)
     assert made["muscle"].parameters == pytest.approx((0.006, 5.0, 1.2, 0.5, 0.03, 3.0))
     names = build_unknowns(study).names
     still = [name for name, group in zip(names, build_groupings(study)[-1], strict=True) if group < 0]

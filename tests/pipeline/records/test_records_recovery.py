@@ -153,7 +153,7 @@ def test_depths_under_a_force_follow_the_parameters(tmp_path: Path, no_own_recor
     text = STUDY.replace("load_steps = 10", "load_steps = 3").replace("unload_steps = 10", "unload_steps = 3")
     context = stored(tmp_path, text.replace('"a.csv"', '"a-creep.csv"\ncontrol = "force"'))
     (record,) = (load_site_record(context, record) for record in context.study.recorded)
-    assert record.measured.unit == "mm"
+    assert record.curve.unit == "mm"
     vector = context.study.vector(TRUTH)
     found = to_response(simulate(record.job(vector)))
     assert found.completed

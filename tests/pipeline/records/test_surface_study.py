@@ -77,8 +77,8 @@ def test_what_cameras_see_is_fitted_and_predicted(tmp_path: Path, monkeypatch) -
         records, at, known = estimate_at_truth(context)
         widths.append(np.sqrt(known.intervals_95[:, 1] / known.intervals_95[:, 0]))
     assert [one.name for one in records.own] == ["a", "a+surface"]
-    assert [one.unit for one in records.measured] == ["N", "mm"]
-    assert {one.site_name for one in records.measured} == {"a"}  # left out together
+    assert [one.unit for one in records.curves] == ["N", "mm"]
+    assert {one.site_name for one in records.curves} == {"a"}  # left out together
     seen, noise = records.own[1], known.residual_model.noise[1]
     off = at.responses[1].force_N - seen.compared
     assert len(off) > 300

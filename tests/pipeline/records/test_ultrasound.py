@@ -162,7 +162,7 @@ def test_what_ultrasound_sees_is_fitted_and_predicted(tmp_path: Path, monkeypatc
         records, at, known = estimate_at_truth(context)
         widths.append(np.log(known.intervals_95[:, 1] / known.intervals_95[:, 0]))
     assert [one.name for one in records.own] == ["a", "a+skin", "a+muscle"]
-    assert [one.unit for one in records.measured] == ["N", "mm", "mm"]
+    assert [one.unit for one in records.curves] == ["N", "mm", "mm"]
     for one, response, noise in zip(
         records.own[1:], at.responses[1:], known.residual_model.noise[1:], strict=True
     ):

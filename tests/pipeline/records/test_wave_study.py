@@ -55,8 +55,8 @@ def test_speeds_are_fitted_and_predicted(tmp_path: Path, monkeypatch) -> None:
         records, at, known = estimate_at_truth(context)
         widths.append(np.log(known.intervals_95[:, 1] / known.intervals_95[:, 0]))
     assert [one.name for one in records.own] == ["a", "a+skin-waves", "a+muscle-waves"]
-    assert [one.unit for one in records.measured] == ["N", "m/s", "m/s"]
-    assert {one.site_name for one in records.measured} == {"a"}
+    assert [one.unit for one in records.curves] == ["N", "m/s", "m/s"]
+    assert {one.site_name for one in records.curves} == {"a"}
     for one, response, noise in zip(
         records.own[1:], at.responses[1:], known.residual_model.noise[1:], strict=True
     ):

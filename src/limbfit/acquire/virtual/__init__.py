@@ -6,4 +6,4 @@ that such devices plausibly have; it is no model of a particular one.
 
 from .fitsocket import FAULT_KINDS, Fault, VirtualFitSocket, read_faults
 from .parts import Surrogate, VirtualLimb, fit_surrogate
-from .server import Serving, serve
+from .server import Endpoint, serve

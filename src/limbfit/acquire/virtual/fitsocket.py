@@ -155,7 +155,7 @@ class VirtualFitSocket:
         self.host_has_left = False
 
     @property
-    def refused(self) -> object:
+    def refusals(self) -> object:
         return self._decoder.refused
 
     def disconnect(self) -> None:
@@ -201,7 +201,7 @@ class VirtualFitSocket:
                 self.host_has_left = True
                 return b""
         code = "greeted" if isinstance(command, wire.Hello) else self._execute(command)
-        return self._encode(wire.Declined(number, code).body if code else wire.Accepted(number).body)
+        return self._encode(wire.Rejection(number, code).body if code else wire.Acceptance(number).body)
 
     def _greet(self, hello: wire.Hello) -> bytes:
         if hello.version != wire.VERSION:
@@ -371,7 +371,7 @@ class VirtualFitSocket:
         if not code:
             return b""
         self._stop(code)
-        return self._encode(wire.LimitTripped(code, pin).body)
+        return self._encode(wire.LimitTrip(code, pin).body)
 
     def _stop(self, code: str) -> None:
         if not self.stopped:
@@ -391,7 +391,7 @@ class VirtualFitSocket:
             return b""
         self._given_up = True
         pins = sum(1 << int(k) for k in np.flatnonzero(~self.motors.find_withdrawn()))
-        return self._encode(wire.OutOfReach(pins).body)
+        return self._encode(wire.StuckPins(pins).body)
 
     # -- what goes wrong
 

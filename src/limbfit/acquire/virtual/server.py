@@ -49,7 +49,7 @@ class PtyLink(Link):
 
 
 @dataclass
-class Serving:
+class Endpoint:
     """Where a device can be reached; ``stop`` ends `serve` (from a signal handler or another thread)."""
 
     listener: socket.socket | None = None
@@ -58,7 +58,7 @@ class Serving:
     refused: int = 0  # connections beside the one that holds the device
 
     @classmethod
-    def on_port(cls, host: str, port: int) -> Serving:
+    def listen_on_port(cls, host: str, port: int) -> Endpoint:
         """Listen on a TCP port; 0 takes a free one. Raises `InputError` where the address is none of this
         machine's, or the port is taken.
         """
@@ -81,7 +81,7 @@ class Serving:
         return cls(listener=listener)
 
     @classmethod
-    def on_terminal(cls) -> Serving:
+    def open_terminal(cls) -> Endpoint:
         return cls(pty=PtyLink())
 
     @property
@@ -105,12 +105,12 @@ class Serving:
 
 def serve(
     device: VirtualFitSocket,
-    serving: Serving,
+    serving: Endpoint,
     *,
     speed: float = 1.0,
     tell: Callable[[str], None] = lambda _: None,
 ) -> None:
-    """Run a device until `Serving.stop`; ``tell`` is called with a line for each session and each stop.
+    """Run a device until `Endpoint.stop`; ``tell`` is called with a line for each session and each stop.
 
     ``speed``: how much faster than the wall's the device's clock may go; only a paced device waits for its
     host.
@@ -121,7 +121,7 @@ def serve(
 
 class _Server:
     def __init__(
-        self, device: VirtualFitSocket, serving: Serving, speed: float, tell: Callable[[str], None]
+        self, device: VirtualFitSocket, serving: Endpoint, speed: float, tell: Callable[[str], None]
     ) -> None:
         self.device, self.serving, self.tell = device, serving, tell
         self.period_s = PERIOD_US / 1e6 / speed

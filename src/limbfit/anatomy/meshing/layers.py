@@ -295,7 +295,7 @@ def _extract_offset_surface(surface: Surface, distance_mm: float) -> Surface:
     grid = pv.ImageData(dimensions=size, spacing=[LINER_SPACING_MM] * 3, origin=low)
     grid.point_data["distance"] = evaluate_distance(surface, np.asarray(grid.points))[0]
     found = grid.contour([distance_mm], scalars="distance", method="flying_edges", compute_normals=False)
-    outer = find_bodies(from_pyvista(found.clean()))[0].outward
+    outer = find_bodies(from_pyvista(found.clean()))[0].outward_surface
     return Surface(_project_to_offset(surface, outer.points, distance_mm), outer.faces)
 
 

@@ -191,7 +191,7 @@ def name_bones(bones: list[Mask], spacing: Array) -> list[str]:
     femur's height. One long bone alone is a thigh's or an upper arm's, two of a size are a forearm's. What
     fits none of these is ``bone-1`` and so on.
     """
-    shapes = [_Extent.of(bone, spacing) for bone in bones]
+    shapes = [_Extent.from_mask(bone, spacing) for bone in bones]
     names: dict[int, str] = {}
     if not bones:
         return []
@@ -223,7 +223,7 @@ class _Extent:
     volume: float
 
     @classmethod
-    def of(cls, bone: Mask, spacing: Array) -> _Extent:
+    def from_mask(cls, bone: Mask, spacing: Array) -> _Extent:
         areas = bone.sum(axis=(1, 2))
         filled = np.flatnonzero(areas)
         return cls(

@@ -61,7 +61,7 @@ def extract_marked_skin(volume: Volume) -> tuple[Surface, Mask]:
     limb = find_limb_mask(volume, smooth)
     box = find_box(limb, 2 * np.ceil(_RIM_MM / volume.spacing[::-1]).astype(int) + 2)
     contour = _extract_outline(smooth[box], limb[box], volume.spacing)
-    return Surface(volume.crop(box).index_to_point(contour.points), contour.faces).outward, limb
+    return Surface(volume.crop(box).index_to_point(contour.points), contour.faces).outward_surface, limb
 
 
 def _extract_outline(smooth: Field, limb: Mask, spacing: Array) -> Surface:

@@ -45,7 +45,7 @@ def extract_fine_surface(labels: LabelMap, which: str | None, edge_mm: float) ->
     body, crop = _select_body(mask, labels, which or "limb")
     field, level = smooth_field(body, crop, edge_mm)
     contour = extract_contour(field.array, level)
-    rough = Surface(field.index_to_point(contour.points), contour.faces).outward
+    rough = Surface(field.index_to_point(contour.points), contour.faces).outward_surface
     passes, band = _TAUBIN_SKIN if which is None else _TAUBIN_BONE  # windowed sinc (Taubin 1995)
     smooth = rough.to_pyvista().smooth_taubin(n_iter=passes, pass_band=band, normalize_coordinates=True)
     return keep_volume(from_pyvista(smooth), float(body.sum()) * crop.voxel_mm3)

@@ -62,20 +62,20 @@ class Surface:
         return {"points": self.points, "faces": self.faces}
 
     @cached_property
-    def _contiguous(self) -> tuple[Array, Indices]:
+    def _contiguous_arrays(self) -> tuple[Array, Indices]:
         """Points and faces as libigl takes them."""
         return np.ascontiguousarray(self.points), np.ascontiguousarray(self.faces)
 
     @cached_property
     def _boxes(self) -> igl.AABB:
         tree = igl.AABB()
-        tree.init(*self._contiguous)
+        tree.init(*self._contiguous_arrays)
         return tree
 
     @cached_property
     def _windings(self) -> igl.FastWindingNumberBVH:
         tree = igl.FastWindingNumberBVH()
-        tree.init(*self._contiguous)
+        tree.init(*self._contiguous_arrays)
         return tree
 
     def find_nearest(self, points: ArrayLike) -> tuple[Array, Indices, Array]:
@@ -83,7 +83,7 @@ class Surface:
         query = np.ascontiguousarray(points, dtype=np.float64).reshape(-1, 3)
         if not len(query):
             return np.zeros(0), np.zeros(0, dtype=np.int64), np.zeros((0, 3))
-        squared, face, foot = self._boxes.squared_distance(*self._contiguous, query)
+        squared, face, foot = self._boxes.squared_distance(*self._contiguous_arrays, query)
         return squared, face, foot
 
     def find_signed(self, points: ArrayLike) -> tuple[Array, Indices, Array]:
@@ -121,7 +121,7 @@ class Surface:
     @cached_property
     def self_intersections(self) -> Indices:
         """(p, 2) pairs of faces without a common point of which an edge of one pierces the other."""
-        _, pairs, coplanar = find_self_intersections(*self._contiguous)
+        _, pairs, coplanar = find_self_intersections(*self._contiguous_arrays)
         pairs = np.sort(pairs[~coplanar.astype(bool).ravel()], axis=1)
         first, second = self.faces[pairs[:, 0]], self.faces[pairs[:, 1]]
         apart = ~(first[:, :, None] == second[:, None, :]).any(axis=(1, 2))
@@ -162,14 +162,14 @@ class Surface:
         return _normalise_rows(normals)
 
     @property
-    def flipped(self) -> Surface:
+    def flipped_surface(self) -> Surface:
         """The same surface seen from the other side."""
         return replace(self, faces=self.faces[:, ::-1])
 
     @property
-    def outward(self) -> Surface:
+    def outward_surface(self) -> Surface:
         """The same closed surface with its faces looking outward."""
-        return self if self.volume > 0.0 else self.flipped
+        return self if self.volume > 0.0 else self.flipped_surface
 
     def to_pyvista(self) -> pv.PolyData:
         faces: Any = self.faces  # pyvista's stubs know no int64

@@ -46,14 +46,14 @@ class ContactSurface:
     @property
     def points_at_rest(self) -> Array:
         """The quadrature points (f, q, 3) of the undeformed surface, mm."""
-        return self.at(self.points)
+        return self.interpolate_points(self.points)
 
     def gaps_at_rest(self, indenter: RigidShape) -> Array:
         """Signed distances (f, q) of the undeformed surface, mm."""
         points = self.points_at_rest
         return indenter.signed_distance(points.reshape(-1, 3)).reshape(points.shape[:2])
 
-    def at(self, nodes: Array) -> Array:
+    def interpolate_points(self, nodes: Array) -> Array:
         """The quadrature points (f, q, 3) of nodes that are at ``nodes (n, 3)``, mm."""
         return np.einsum("qk,fki->fqi", self.N, nodes[self.faces], optimize=True)
 
@@ -81,15 +81,15 @@ class Touch:
     forces: Array
 
     @property
-    def closed(self) -> Mask:
+    def is_closed(self) -> Mask:
         return self.gaps < 0.0
 
-    def under(self, closed: Mask) -> tuple[Array, Array]:
+    def assume_closed(self, closed: Mask) -> tuple[Array, Array]:
         """Blocks (c, 3, 3) and the change of the contact forces (c, 3) were ``closed`` the points in touch.
 
         A point that closes pulls until it touches; one that opens is let go.
         """
-        change = closed.astype(float) - self.closed
+        change = closed.astype(float) - self.is_closed
         stiff = self.weights[:, None, None] * self.normals[:, :, None] * self.normals[:, None, :]
         gaps = np.where(change != 0.0, self.gaps, 0.0)
         pushing = np.where((change > 0)[:, None, None], stiff, self.blocks - self.stick)
@@ -109,7 +109,7 @@ def find_touching_offset(surface: ContactSurface, indenter: RigidShape) -> float
     end, least = float(along.max()) + indenter.length, 1e-3 * indenter.width
 
     def gap(advance: float) -> float:
-        return float(indenter.moved(advance).signed_distance(at).min())
+        return float(indenter.move(advance).signed_distance(at).min())
 
     while high < end and (distance := gap(high)) > 0.0:
         low, high = high, high + max(distance, least)

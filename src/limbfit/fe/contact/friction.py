@@ -68,7 +68,7 @@ class StickyContact(ABC):
         places, normals, pulls = (x.reshape(-1, 3) for x in (self.places, self.normals, self.pulls))
         return self.held.ravel(), places, normals, self.bounds.ravel(), pulls
 
-    def without_derivatives(self) -> Self:
+    def drop_derivatives(self) -> Self:
         """The same points without derivatives, to be kept."""
         return replace(self, d_places=np.zeros((*self.held.shape, 3, 0)))
 
@@ -108,13 +108,13 @@ class Anchors(StickyContact):
     d_normals: Array
 
     @classmethod
-    def none(cls, surface: ContactSurface, parameters: int = 0) -> Anchors:
+    def begin(cls, surface: ContactSurface, parameters: int = 0) -> Anchors:
         shape = surface.areas.shape
         vectors, slopes = np.zeros((*shape, 3)), np.zeros((*shape, 3, parameters))
         held, bounds = np.zeros(shape, dtype=bool), np.full(shape, np.inf)
         return cls(held, vectors, vectors, bounds, slopes, vectors, slopes)
 
-    def without_derivatives(self) -> Self:
+    def drop_derivatives(self) -> Self:
         nothing = np.zeros((*self.held.shape, 3, 0))
         return replace(self, d_places=nothing, d_normals=nothing)
 
@@ -125,7 +125,7 @@ class Anchors(StickyContact):
 
     def advance(self, tool: Tool, du: Array | None) -> Anchors:
         """The anchors at the end of a step: points that touch for the first time are held where they are."""
-        local, near, shape = tool.local, Distances.of(tool), self.held.shape
+        local, near, shape = tool.local_points, Distances.from_tool(tool), self.held.shape
         closed, normals = near.scatter(near.gaps, shape) < 0.0, near.scatter(near.normals, shape)
         new = (closed & ~self.held)[..., None]
         d_places, d_normals = self.d_places, self.d_normals
@@ -137,7 +137,7 @@ class Anchors(StickyContact):
         return Anchors(closed, places, normals, self.bounds, d_places, self.pulls, d_normals)
 
     def differentiate_anchors(self, tool: Tool) -> Array:
-        move = tool.local - self.places
+        move = tool.local_points - self.places
         n, d_n, d_a = self.normals[..., None], self.d_normals, self.d_places
         across = np.einsum("fqi,fqi->fq", self.normals, move)[..., None, None]
         turned = np.einsum("fqip,fqi->fqp", d_n, move) + -np.einsum("fqi,fqip->fqp", self.normals, d_a)
@@ -158,7 +158,7 @@ class Coulomb(StickyContact):
     lags: ClassVar[bool] = True
 
     @classmethod
-    def none(cls, mu: float, surface: ContactSurface, parameters: int = 0, hardness: float = 1.0) -> Self:
+    def begin(cls, mu: float, surface: ContactSurface, parameters: int = 0, hardness: float = 1.0) -> Self:
         shape = surface.areas.shape
         nothing, vectors = np.zeros(shape), np.zeros((*shape, 3))
         slopes = np.zeros((*shape, 3, parameters))
@@ -166,11 +166,11 @@ class Coulomb(StickyContact):
 
     def renew(self, tool: Tool) -> Self:
         """Planes, bounds and pulls as they are where the tool is."""
-        now = self._at(Distances.of(tool, self.held))
-        return replace(now, pulls=_Slip.of(now, tool.local).elastic)
+        now = self._update_bounds(Distances.from_tool(tool, self.held))
+        return replace(now, pulls=_Slip.from_points(now, tool.local_points).elastic)
 
     def predict(self, tool: Tool, du: Array) -> Self:
-        slip = _Slip.of(self, tool.local)
+        slip = _Slip.from_points(self, tool.local_points)
         moved = tool.relative_motion(du[..., None])[..., 0]
         some = np.where(self.bounds > 0.0, self.bounds, 1.0)[..., None]
         lead = _shorten_to_bounds(self.pulls, self.bounds) / some
@@ -179,7 +179,7 @@ class Coulomb(StickyContact):
         change = slip.share[..., 0] * (across - np.where(slip.stuck[..., None], 0.0, along * lead))
         return replace(self, pulls=_shorten_to_bounds(slip.elastic + change, self.bounds))
 
-    def _at(self, near: Distances) -> Self:
+    def _update_bounds(self, near: Distances) -> Self:
         bounds = self.mu / self.hardness * np.maximum(-near.gaps, 0.0) * near.steepness
         normals = near.scatter(near.normals, self.held.shape)
         return replace(self, normals=normals, bounds=near.scatter(bounds, self.held.shape))
@@ -187,10 +187,10 @@ class Coulomb(StickyContact):
     def advance(self, tool: Tool, du: Array | None) -> Coulomb:
         """The anchors at the end of a step: those of new points where they are, those of slipping ones drawn
         along; planes and bounds are those that hold there."""
-        near = Distances.of(tool, self.held)
-        now = self._at(near)
-        closed, local = now.bounds > 0.0, tool.local
-        slip = _Slip.of(now, local)
+        near = Distances.from_tool(tool, self.held)
+        now = self._update_bounds(near)
+        closed, local = now.bounds > 0.0, tool.local_points
+        slip = _Slip.from_points(now, local)
         new, drawn = (closed & ~self.held)[..., None], (closed & self.held & ~slip.stuck)[..., None]
         places = np.where(new, local, np.where(drawn, local - slip.elastic, self.places))
         d_places = self.d_places
@@ -204,17 +204,17 @@ class Coulomb(StickyContact):
         return replace(now, held=closed, places=places, d_places=d_places, pulls=pulls)
 
     def differentiate_anchors(self, tool: Tool) -> Array:
-        return np.asarray(-self.hardness * _Slip.of(self, tool.local).tangent @ self.d_places)
+        return np.asarray(-self.hardness * _Slip.from_points(self, tool.local_points).tangent @ self.d_places)
 
     def coupling(self, tool: Tool) -> Array:
         """Derivative (f, q, 3, 3) of the forces, over penalty and area, through planes and bounds, which are
         those that hold where the tool is."""
-        near = Distances.of(tool, self.held)
-        return self.hardness * self._coupling(near, _Slip.of(self, tool.local))
+        near = Distances.from_tool(tool, self.held)
+        return self.hardness * self._coupling(near, _Slip.from_points(self, tool.local_points))
 
     def _coupling(self, near: Distances, slip: _Slip) -> Array:
         """That of the elastic part of the slip."""
-        bends, deeper = (near.scatter(values, self.held.shape) for values in (near.tilts, near.pressing))
+        bends, deeper = (near.scatter(values, self.held.shape) for values in (near.tilts, near.force_slopes))
         n, move = self.normals, slip.move
         across = np.einsum("fqi,fqi->fq", n, move)[..., None, None]
         turned = -(across * bends + n[..., None] * np.einsum("fqi,fqij->fqj", move, bends)[:, :, None])
@@ -241,11 +241,10 @@ class StepwiseCoulomb(Coulomb):
 
     def advance(self, tool: Tool, du: Array | None) -> StepwiseCoulomb:
         """Every point where it is at the end of a step."""
-        places, d_places = tool.local, self.d_places if du is None else tool.relative_motion(du)
-        now = self.renew(tool)
-        return replace(now, held=np.ones_like(self.held), places=places, d_places=d_places)._at(
-            Distances.of(tool, np.ones_like(self.held))
-        )
+        places, d_places = tool.local_points, self.d_places if du is None else tool.relative_motion(du)
+        now, held = self.renew(tool), np.ones_like(self.held)
+        now = replace(now, held=held, places=places, d_places=d_places)
+        return now._update_bounds(Distances.from_tool(tool, held))
 
 
 # How long a point that sticks keeps its anchor: until it slips, or for one step.
@@ -274,7 +273,7 @@ class _Slip:
     tangent: Array
 
     @classmethod
-    def of(cls, grip: Coulomb, local: Array) -> _Slip:
+    def from_points(cls, grip: Coulomb, local: Array) -> _Slip:
         n, move = grip.normals, local - grip.places
         slip = move - np.einsum("fqi,fqi->fq", n, move)[..., None] * n
         length = np.linalg.norm(slip, axis=-1)

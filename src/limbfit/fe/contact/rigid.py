@@ -77,16 +77,16 @@ class RigidShape(ABC):
         return np.asarray(self.edge, dtype=float)
 
     @abstractmethod
-    def placed(self, centre: Array, axis: Array, edge: Array) -> Self:
+    def place(self, centre: Array, axis: Array, edge: Array) -> Self:
         """The shape with another frame."""
 
-    def moved(self, distance: float, across: Sequence[float] = (0.0, 0.0)) -> Self:
+    def move(self, distance: float, across: Sequence[float] = (0.0, 0.0)) -> Self:
         """The shape, advanced along its axis by ``distance`` mm and ``across`` it along x and y."""
         move = np.array([*across, distance]) @ self.frame
-        return self.placed(np.asarray(self.centre, dtype=float) + move, *self.frame[[2, 0]])
+        return self.place(np.asarray(self.centre, dtype=float) + move, *self.frame[[2, 0]])
 
     @abstractmethod
-    def near(self, points: Array) -> Mask:
+    def find_near(self, points: Array) -> Mask:
         """Which points (n, 3) of its frame it may touch; the distance of others is not computed."""
 
     @abstractmethod
@@ -109,7 +109,7 @@ class RigidShape(ABC):
         """True if it has other forms than its final one."""
         return False
 
-    def grown(self, share: float) -> Self:
+    def grow(self, share: float) -> Self:
         """The shape when it has grown so far; 1 is its final form."""
         return self
 
@@ -175,10 +175,10 @@ class Indenter(RigidShape):
         """From the foremost point to the far end of a surface; the width for shapes without one, mm."""
         return self.body.length
 
-    def placed(self, centre: Array, axis: Array, edge: Array) -> Self:
+    def place(self, centre: Array, axis: Array, edge: Array) -> Self:
         return replace(self, centre=centre, axis=axis, edge=edge)
 
-    def near(self, points: Array) -> Mask:
+    def find_near(self, points: Array) -> Mask:
         x, y, z = points.T
         reach = self.body.reach
         return np.asarray((z <= self.width / 2) & (np.abs(x) <= reach) & (np.abs(y) <= reach))
@@ -219,7 +219,7 @@ class Wall(RigidShape):
         """Its extent along the axis, mm."""
         return float(self._extent[2])
 
-    def placed(self, centre: Array, axis: Array, edge: Array) -> Self:
+    def place(self, centre: Array, axis: Array, edge: Array) -> Self:
         """The surface with another frame; what was derived from its triangles is kept."""
         other = copy(self)
         other.__dict__.pop("frame", None)
@@ -277,7 +277,7 @@ class OpenSurface(Wall):
         brim = np.concatenate([open_edges, np.isin(self.faces, ends)], axis=1)  # (m, 6): edges and corners
         return corners, normals, edges, sums, brim, build_tree(corners, np.arange(len(corners)))
 
-    def near(self, points: Array) -> Mask:
+    def find_near(self, points: Array) -> Mask:
         low, high = self._box
         return np.asarray(((points >= low) & (points <= high)).all(axis=1))
 

@@ -95,7 +95,7 @@ class SmoothSurface(Wall):
             check_open_surface(clear, triangles, "the clear shape")
             both = np.concatenate([used, clear[np.unique(triangles)]])
             reach += float(np.linalg.norm(clear - final, axis=1)[np.unique(triangles)].max())
-        grid = DistanceGrid.around(both, reach, spacing)
+        grid = DistanceGrid.enclose(both, reach, spacing)
         end = fit_spline_coefficients(grid, final, triangles, reach)
         start = end if clear is None else fit_spline_coefficients(grid, clear, triangles, reach)
         fade = 2.0 * spacing if fade is None else fade
@@ -108,12 +108,12 @@ class SmoothSurface(Wall):
     def grows(self) -> bool:
         return self.clear is not None
 
-    def grown(self, share: float) -> Self:
+    def grow(self, share: float) -> Self:
         other = copy(self)
         other.__dict__["growth"] = share
         return other
 
-    def near(self, points: Array) -> Mask:
+    def find_near(self, points: Array) -> Mask:
         place = (points - self.grid.low) / self.grid.spacing
         return np.asarray(((place >= 1.0) & (place < np.array(self.grid.shape) - 2.0)).all(axis=1))
 
@@ -169,7 +169,7 @@ class DistanceGrid:
     shape: tuple[int, int, int]
 
     @classmethod
-    def around(cls, points: Array, reach: float, spacing: float) -> DistanceGrid:
+    def enclose(cls, points: Array, reach: float, spacing: float) -> DistanceGrid:
         """A grid that holds all that is within ``reach`` mm of points (n, 3)."""
         pad = reach + MARGIN * spacing
         low, high = points.min(axis=0) - pad, points.max(axis=0) + pad
@@ -216,18 +216,18 @@ def _extend_past_brim(points: Array, faces: Indices, by: float) -> tuple[Array, 
     used, places = np.unique(np.concatenate([a, b]), return_inverse=True)
     a_at, b_at = places[: len(a)], places[len(a) :]
 
-    def gathered(of_edges: Array) -> Array:
+    def gather_edges(of_edges: Array) -> Array:
         out = np.zeros((len(used), 3))
         np.add.at(out, a_at, of_edges)
         np.add.at(out, b_at, of_edges)
         return out
 
     upright = spread[used] / np.linalg.norm(spread[used], axis=1)[:, None]
-    way = gathered(outward)
+    way = gather_edges(outward)
     for _ in range(AVERAGED):
         way -= np.einsum("ni,ni->n", way, upright)[:, None] * upright
         way /= np.linalg.norm(way, axis=1)[:, None]
-        way = gathered(way[a_at] + way[b_at])
+        way = gather_edges(way[a_at] + way[b_at])
     way -= np.einsum("ni,ni->n", way, upright)[:, None] * upright
     way /= np.linalg.norm(way, axis=1)[:, None]
     a_past, b_past = len(points) + a_at, len(points) + b_at

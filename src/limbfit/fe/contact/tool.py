@@ -77,10 +77,10 @@ class Pose:
         frame, centre = self.start.frame, np.asarray(self.start.centre, dtype=float)
         shift = self.coordinates[:3] @ frame
         if not self.is_turned:
-            return self.start.placed(centre + shift, frame[2], frame[0])
+            return self.start.place(centre + shift, frame[2], frame[0])
         axes = frame @ self.rotation.T
         place = self.pivot + shift + self.rotation @ (centre - self.pivot)
-        return self.start.placed(place, axes[2], axes[0])
+        return self.start.place(place, axes[2], axes[0])
 
     def levers(self, points: Array, coordinates: NDArray[np.intp]) -> Array:
         """(c, 3, k): relative displacement of points (c, 3) per unit of the ``coordinates (k,)``."""
@@ -95,7 +95,7 @@ class Pose:
     def _from_pivot(self, points: Array) -> Array:
         return np.asarray(points - self.pivot - self.coordinates[:3] @ self.start.frame)
 
-    def turning(self, forces: Array, coordinates: NDArray[np.intp]) -> Array:
+    def compute_turning(self, forces: Array, coordinates: NDArray[np.intp]) -> Array:
         """(c, 3, k): change of the forces (c, 3), which turn with the body, per unit of the coordinates."""
         out = np.zeros((len(forces), 3, len(coordinates)))
         for column, i in enumerate(coordinates):
@@ -103,7 +103,7 @@ class Pose:
                 out[:, :, column] = forces @ self.rotation @ self.slopes[i - 3].T
         return out
 
-    def bending(self, points: Array, forces: Array, coordinates: NDArray[np.intp]) -> Array:
+    def compute_bending(self, points: Array, forces: Array, coordinates: NDArray[np.intp]) -> Array:
         """(k, k): second derivative of the energy through the rotation's own curvature, for the energy's
         derivatives ``forces (c, 3)`` with respect to the points (c, 3)."""
         moments = self._from_pivot(points).T @ forces
@@ -143,17 +143,17 @@ class Tool:
     @cached_property
     def places(self) -> Array:
         """The contact points (f, q, 3) in space, mm."""
-        return self.surface.at(self.surface.points + self.u[: len(self.surface.points)])
+        return self.surface.interpolate_points(self.surface.points + self.u[: len(self.surface.points)])
 
     @cached_property
-    def local(self) -> Array:
+    def local_points(self) -> Array:
         """The contact points (f, q, 3) in the body's frame, mm."""
         return (self.places - np.asarray(self.body.centre)) @ self.body.frame.T
 
     @property
     def gaps(self) -> Array:
         """Signed distances (f, q) at the contact points, mm."""
-        return self.body.local_distance(self.local)[0]
+        return self.body.local_distance(self.local_points)[0]
 
     @property
     def units(self) -> Array:
@@ -201,10 +201,10 @@ class Distances:
     bends: Array
 
     @classmethod
-    def of(cls, tool: Tool, also: Mask | None = None) -> Distances:
+    def from_tool(cls, tool: Tool, also: Mask | None = None) -> Distances:
         """From the body where it is; ``also (f, q)`` points far away."""
-        local = tool.local.reshape(-1, 3)
-        near = tool.body.near(local)
+        local = tool.local_points.reshape(-1, 3)
+        near = tool.body.find_near(local)
         if also is not None:
             near |= also.ravel()
         points = np.flatnonzero(near)
@@ -234,7 +234,7 @@ class Distances:
         return (self.bends - along) / steep[:, None, None]
 
     @property
-    def pressing(self) -> Array:
+    def force_slopes(self) -> Array:
         """(k, 3) derivatives of the normal force of points in touch, ``-gap |slope|``."""
         gaps = np.where(np.isfinite(self.gaps), self.gaps, 0.0)[:, None]
         bent = np.einsum("kij,kj->ki", self.bends, self.normals)

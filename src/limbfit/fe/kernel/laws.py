@@ -117,7 +117,7 @@ class EvaluationPoints:
     prestretch: Array
 
     @classmethod
-    def at(
+    def from_cells(
         cls, mesh: Mesh, element: Element, cells: Indices, local: Array, fibres: Array, prestretch: Array
     ) -> EvaluationPoints:
         """Points with ``local`` coordinates (m, 3) in ``cells`` (m,) of a mesh.

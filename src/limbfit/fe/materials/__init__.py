@@ -4,8 +4,8 @@ from .elastic import VOLUMETRIC_LAWS as VOLUMETRIC_LAWS
 from .elastic import ElasticLaw as ElasticLaw
 from .elastic import lane_function as lane_function
 from .elastic import mean_exponential as mean_exponential
-from .fibred import Contractile as Contractile
-from .fibred import Fibred as Fibred
+from .fibred import ContractileMaterial as ContractileMaterial
+from .fibred import FibredMaterial as FibredMaterial
 from .hyperelastic import FungQLV as FungQLV
 from .hyperelastic import MooneyRivlin as MooneyRivlin
 from .hyperelastic import NeoHookean as NeoHookean

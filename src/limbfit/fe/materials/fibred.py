@@ -63,7 +63,7 @@ class _Extension(Material):
 
 
 @dataclass(frozen=True)
-class Fibred(_Extension):
+class FibredMaterial(_Extension):
     """A `Material` with fibres; their direction is the problem's (`Problem.fibres`).
 
     Parameters
@@ -92,7 +92,7 @@ class Fibred(_Extension):
 
 
 @dataclass(frozen=True)
-class Contractile(_Extension):
+class ContractileMaterial(_Extension):
     """A `Material` with fibres that contract; when and how much of it is the problem's `Problem.activation`.
 
     Parameters
@@ -101,7 +101,7 @@ class Contractile(_Extension):
     active : true stress along the fibres of full activation, MPa, not negative.
     """
 
-    passive: Fibred
+    passive: FibredMaterial
     active: float
 
     def __post_init__(self) -> None:

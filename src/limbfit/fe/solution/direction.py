@@ -26,12 +26,12 @@ def find_newton_direction(
     Where the model is not convex it is only a direction of descent.
     """
     b = -at.residual.ravel()[system.free][:, None]
-    if not factor.ready and factor.lasting:
+    if not factor.ready and factor.is_lasting:
         _begin(system, at, factor)
     if damping:
         at = replace(at, data=factor.stiffen(at.tangent, damping))
     if at.touch is None:
-        if not factor.lasting:
+        if not factor.is_lasting:
             factor.factorise(at.tangent)
         found = factor.solve(at.tangent, b, None, tolerance)
         if not found.converged and found.convex:
@@ -39,7 +39,7 @@ def find_newton_direction(
     else:
         found = _solve_with_contact(system, at, at.touch, factor, b, tolerance)
         if float(b[:, 0] @ found.x[:, 0]) <= 0.0:
-            springs = _match_springs(factor, at, at.touch, at.touch.closed, at.tangent)
+            springs = _match_springs(factor, at, at.touch, at.touch.is_closed, at.tangent)
             found = factor.solve(at.tangent, b, springs, tolerance)  # the closed points stay closed
     direction = np.zeros(at.residual.size)
     direction[system.free] = found.x[:, 0]
@@ -51,19 +51,19 @@ def _change(factor: Factor, at: Evaluation, touch: Touch, closed: Mask) -> Sprin
 
     Where those of the present set already differ too much, there is a new factor.
     """
-    still = np.zeros_like(touch.closed)
+    still = np.zeros_like(touch.is_closed)
     if factor.change_springs(still, touch.normals, touch.blocks) is None:
         factor.factorise(at.tangent, touch.blocks)
-    return factor.change_springs(closed != touch.closed, touch.normals, touch.under(closed)[0])
+    return factor.change_springs(closed != touch.is_closed, touch.normals, touch.assume_closed(closed)[0])
 
 
 def _match_springs(
     factor: Factor, at: Evaluation, touch: Touch, closed: Mask, data: Array
 ) -> SpringChange | None:
     """`_change`; what does not last is made anew for ``data``, the tangent with those springs, instead."""
-    if factor.lasting:
+    if factor.is_lasting:
         return _change(factor, at, touch, closed)
-    factor.factorise(data, touch.under(closed)[0])
+    factor.factorise(data, touch.assume_closed(closed)[0])
     return None
 
 
@@ -71,22 +71,22 @@ def _solve_with_contact(
     system: System, at: Evaluation, touch: Touch, factor: Factor, b: Array, tolerance: float
 ) -> LinearSolution:
     bodies = system.bodies
-    found, closed = LinearSolution(np.zeros_like(b), True, True), touch.closed
+    found, closed = LinearSolution(np.zeros_like(b), True, True), touch.is_closed
     for _ in range(ROUNDS):
         guess = found.x
-        if factor.lasting:
+        if factor.is_lasting:
             guess, closed = _predict_closed(system, at, touch, factor, b, guess, closed)
-        blocks, change = touch.under(closed)
+        blocks, change = touch.assume_closed(closed)
         data = bodies.with_springs(at.tangent, blocks - touch.blocks)
         springs = _match_springs(factor, at, touch, closed, data)
         right = b - bodies.spread_forces(change)[:, None]
         found = factor.solve(data, right, springs, tolerance, guess)
         if not found.converged and found.convex:
             found = factor.refactor_and_solve(data, right, blocks, tolerance, found.x)
-        if not found.convex and factor.lasting:
+        if not found.convex and factor.is_lasting:
             found = _solve_for_descent(factor, data, right, blocks, tolerance)
         predicted = _find_closed(touch, bodies.move_springs(found.x[:, 0]))
-        if (predicted == closed).all() or (factor.lasting and springs is None) or not found.convex:
+        if (predicted == closed).all() or (factor.is_lasting and springs is None) or not found.convex:
             break
         closed = predicted
     return found
@@ -97,7 +97,7 @@ def _solve_for_descent(
 ) -> LinearSolution:
     """Where an old factor met negative curvature: the solution of a new one, stiffened where need be."""
     factor.factorise(data, blocks)
-    if not factor.shifted:
+    if not factor.is_shifted:
         found = factor.solve(data, b, None, tolerance)
         if found.convex:
             return found
@@ -114,23 +114,23 @@ def _predict_closed(
     """Displacement (n, 1) and closed points by the factor's model, from ``x (n, 1)`` on."""
     springs = _change(factor, at, touch, closed)
     if springs is None:
-        return x, touch.closed
+        return x, touch.is_closed
     before = system.bodies.move_springs(x[:, 0])
     y = factor.forward(b - factor.multiply(at.tangent, x) if x.any() else b)
-    moved = factor.columns.displace_points(y, closed | touch.closed)
+    moved = factor.columns.displace_points(y, closed | touch.is_closed)
     part = None
     for _ in range(SWEEPS):
-        blocks, change = touch.under(closed)
-        springs = factor.change_springs(closed != touch.closed, touch.normals, blocks)
+        blocks, change = touch.assume_closed(closed)
+        springs = factor.change_springs(closed != touch.is_closed, touch.normals, blocks)
         if springs is None:
             break
         forces = -change - np.einsum("cij,cj->ci", blocks - touch.blocks, before)
         part, kept = springs.coefficients(moved, forces), closed
-        closed = _find_closed(touch, before + moved + springs.at_points(part))
+        closed = _find_closed(touch, before + moved + springs.combine_at_points(part))
         if (closed == kept).all():
             break
     if part is None:
-        return x, touch.closed
+        return x, touch.is_closed
     return x + factor.backward(factor.columns.add_to(y, part[:, None])), kept
 
 
@@ -148,11 +148,11 @@ def solve_at(at: Evaluation, factor: Factor, b: Array, x: Array, tolerance: floa
 
 def update_springs(at: Evaluation, factor: Factor) -> SpringChange | None:
     """The springs by which an evaluation differs from what is factorised; what does not last is made anew."""
-    if not factor.ready or not factor.lasting:
+    if not factor.ready or not factor.is_lasting:
         refactor_at(at, factor)
-    if at.touch is None or not factor.lasting:
+    if at.touch is None or not factor.is_lasting:
         return None
-    return _change(factor, at, at.touch, at.touch.closed)
+    return _change(factor, at, at.touch, at.touch.is_closed)
 
 
 def _begin(system: System, at: Evaluation, factor: Factor) -> None:

@@ -112,19 +112,19 @@ class Factor:
         self.seconds["factor"] += time.perf_counter() - started
 
     @property
-    def shifted(self) -> bool:
+    def is_shifted(self) -> bool:
         """True if what was factorised last had to be stiffened."""
         return self._shift > 0.0
 
     @property
-    def lasting(self) -> bool:
+    def is_lasting(self) -> bool:
         """True if what was factorised is worth keeping for other matrices."""
         return self.solver.lasting
 
     @property
     def limit(self) -> int:
         """Products after which a new factorisation would have been cheaper."""
-        return int(self.solver.worth) if self.lasting else MAX_CYCLES
+        return int(self.solver.worth) if self.is_lasting else MAX_CYCLES
 
     def is_worn(self) -> bool:
         """True if another step with this factor costs more than the steps since it was made did on average.
@@ -132,7 +132,7 @@ class Factor:
         The optimal time to replace a machine whose running cost rises (Barlow and Proschan 1965).
         """
         steps = self._costs
-        return self.lasting and len(steps) > 1 and steps[-1] * len(steps) > self.solver.worth + sum(steps)
+        return self.is_lasting and len(steps) > 1 and steps[-1] * len(steps) > self.solver.worth + sum(steps)
 
     def start_step(self) -> None:
         """From here the cost counts for another step."""
@@ -146,7 +146,7 @@ class Factor:
 
         ``blocks (c, 3, 3)``: the contact springs that are in ``data``.
         """
-        made = not self.ready and self.lasting and self._is_single_enough(data)
+        made = not self.ready and self.is_lasting and self._is_single_enough(data)
         started = time.perf_counter()
         shift = self._next_shift
         while not made and not self._try_factorise(data, shift):
@@ -169,7 +169,7 @@ class Factor:
         return data + share * self._shear
 
     def _try_factorise(self, data: Array, shift: float) -> bool:
-        self.counts["factorisations" if self.lasting else "multigrids"] += 1
+        self.counts["factorisations" if self.is_lasting else "multigrids"] += 1
         data = self.stiffen(data, shift) if shift else data
         if len(self._ground[0]):  # a body that touches nothing yet is held by nothing
             data = data.copy()
@@ -193,17 +193,17 @@ class Factor:
 
     def apply(self, b: Array) -> Array:
         """The factor's solution for ``b (n,)`` or ``(n, r)``."""
-        return self._timed(self.solver.solve, b, 1.0)
+        return self._time_half(self.solver.solve, b, 1.0)
 
     def forward(self, b: Array, last: bool = False) -> Array:
         """The first half of `apply`, as in `LinearSolver`."""
-        return self._timed(lambda b: self.solver.forward(b, last), b, 0.0 if last else 0.5)
+        return self._time_half(lambda b: self.solver.forward(b, last), b, 0.0 if last else 0.5)
 
     def backward(self, y: Array, last: bool = False) -> Array:
         """The second half of `apply`, as in `LinearSolver`."""
-        return self._timed(lambda y: self.solver.backward(y, last), y, 0.0 if last else 0.5)
+        return self._time_half(lambda y: self.solver.backward(y, last), y, 0.0 if last else 0.5)
 
-    def _timed(self, half: Callable[[Array], Array], b: Array, share: float) -> Array:
+    def _time_half(self, half: Callable[[Array], Array], b: Array, share: float) -> Array:
         """What a solver does to ``b``, which costs a ``share`` of a solution."""
         started = time.perf_counter()
         x = half(b)
@@ -255,7 +255,7 @@ class Factor:
             if (rz < 0.0).any():
                 # Multigrid of a matrix that is not positive definite need not be either; a factor that is
                 # not has too few digits.
-                return LinearSolution(x if x.any() else r, False, self.lasting)
+                return LinearSolution(x if x.any() else r, False, self.is_lasting)
             Ap = self.multiply(data, p)
             curvature = np.einsum("ij,ij->j", p, Ap)
             live = rz > 0.0
@@ -274,12 +274,12 @@ class Factor:
         Where even that does not converge, single precision is too little for the matrix, and is given up.
         Multigrid that has not converged is given up for a factor.
         """
-        if not self.lasting:
+        if not self.is_lasting:
             self._choice = "auto"
             self._replace_solver(single=True)
         self.factorise(data, blocks)
         found = self.solve(data, b, None, tolerance, x)
-        if self._single and not self.shifted and found.convex and not found.converged:
+        if self._single and not self.is_shifted and found.convex and not found.converged:
             self._replace_solver(single=False)
             self.factorise(data, blocks)
             found = self.solve(data, b, None, tolerance, x, limit=10 * self.limit)
@@ -496,6 +496,6 @@ class SpringChange:
         out[at] -= self._answer @ (self.project(moved) + self._columns.S @ out)[at]
         return out
 
-    def at_points(self, coefficients: Array) -> Array:
+    def combine_at_points(self, coefficients: Array) -> Array:
         """The combination of columns at the contact points (c, 3)."""
         return self._columns.at_points @ coefficients

@@ -128,23 +128,23 @@ class Pardiso(LinearSolver):
         self._call(22, np.zeros(1), np.zeros(1), 1)
 
     def solve(self, b: Array) -> Array:
-        return self._solved(33, b, False).astype(np.float64)
+        return self._run_phase(33, b, False).astype(np.float64)
 
     def forward(self, b: Array, last: bool = False) -> Array:
-        return self._solved(331, b, last)
+        return self._run_phase(331, b, last)
 
     def backward(self, y: Array, last: bool = False) -> Array:
-        return self._solved(333, y, last).astype(np.float64)
+        return self._run_phase(333, y, last).astype(np.float64)
 
-    def _solved(self, phase: int, b: Array, last: bool) -> Array:
+    def _run_phase(self, phase: int, b: Array, last: bool) -> Array:
         if last:
-            return self._among_last(phase, b)
+            return self._run_among_last(phase, b)
         right = np.asfortranarray(b, dtype=self._type)
         x = np.zeros_like(right, order="F")
         self._call(phase, right, x, 1 if b.ndim == 1 else b.shape[1])
         return x
 
-    def _among_last(self, phase: int, b: Array) -> Array:
+    def _run_among_last(self, phase: int, b: Array) -> Array:
         """A half of solutions (m, r) among the unknowns ``last``."""
         if self._room is None:
             self._room = np.zeros((2, self._n.value * COLUMNS), dtype=self._type)
@@ -238,15 +238,15 @@ class Cholmod(_ByPattern):
     def __init__(self, indptr: Index, indices: Index, *unused: Any) -> None:
         super().__init__(indptr, indices)
         self._cholmod = importlib.import_module("sksparse.cholmod")
-        self._factor = self._cholmod.analyze(self._lower(np.ones(len(indices))), mode="supernodal")
+        self._factor = self._cholmod.analyze(self._build_lower(np.ones(len(indices))), mode="supernodal")
 
-    def _lower(self, data: Array) -> sp.csc_matrix:
+    def _build_lower(self, data: Array) -> sp.csc_matrix:
         # The upper triangle's rows are the lower triangle's columns.
         return sp.csc_matrix((data, *self._pattern), shape=(self._n, self._n))
 
     def factorise(self, data: Array) -> None:
         try:
-            self._factor.cholesky_inplace(self._lower(data))
+            self._factor.cholesky_inplace(self._build_lower(data))
         except self._cholmod.CholmodNotPositiveDefiniteError:
             raise NotPositiveDefiniteError from None
 

@@ -35,7 +35,7 @@ TOLERANCE = 1e-3
 
 
 @dataclass(frozen=True)
-class Explicit:
+class ExplicitDerivative:
     """What the parameters change in a step at fixed displacement.
 
     Parameters
@@ -71,7 +71,7 @@ class MemoryDerivative:
 
     def differentiate_step(
         self, system: System, laws: Laws, memory: Memory, increment: Increment, u: Array, dt: float
-    ) -> Explicit:
+    ) -> ExplicitDerivative:
         """What the parameters change in the step of ``dt`` s that ended at displacement ``u (n, 3)``."""
         bends = laws.d_numbers.any(axis=2)  # parameters of the elastic law
         by_kappa = laws.d_kappa / laws.kappa[:, None]
@@ -100,10 +100,10 @@ class MemoryDerivative:
             )  # fmt: skip
             return forces
 
-        return Explicit(np.asarray(sum(system.map_cells(part))), elastic, stress, slopes)
+        return ExplicitDerivative(np.asarray(sum(system.map_cells(part))), elastic, stress, slopes)
 
     def advance(
-        self, system: System, laws: Laws, before: Memory, step: Explicit, du: Array, dt: float
+        self, system: System, laws: Laws, before: Memory, step: ExplicitDerivative, du: Array, dt: float
     ) -> MemoryDerivative:
         """The derivative of the memory after the step, given ``du (n, 3, p)``; uses up ``step.elastic``."""
         found = compute_prony_factors(dt, laws.prony[..., 1], before.duration)
@@ -181,7 +181,7 @@ _SHEAR = ((0, 3, 5), (3, 1, 4), (5, 4, 2))  # place of each entry of a symmetric
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract"})
-def _by_gradient(p, l, out):  # type: ignore[no-untyped-def]
+def _differentiate_by_gradient(p, l, out):  # type: ignore[no-untyped-def]
     """Derivative (6, 9) of Se with respect to ``F``, column by column, in a lane of a POINT with moduli."""
     for t in range(6):
         for j in range(3):
@@ -240,7 +240,7 @@ def explicit_derivatives(  # type: ignore[no-untyped-def]
             fe[:] = 0.0
             for q in range(len(points)):
                 at = points[q]
-                _by_gradient(at, l, slopes[el, q])
+                _differentiate_by_gradient(at, l, slopes[el, q])
                 for t in range(6):
                     x, y = t % 3, (t + (1 if t > 2 else 0)) % 3
                     stress[el, q, t] = at.tau[t, l]
@@ -348,7 +348,7 @@ class ForceTakeover:
     slopes: Array
 
     @classmethod
-    def none(cls, bodies: Sequence[RigidBody], slopes: Array) -> ForceTakeover:
+    def begin(cls, bodies: Sequence[RigidBody], slopes: Array) -> ForceTakeover:
         """That of bodies that have taken nothing over; ``slopes`` are zeros."""
         return cls(np.full(len(bodies), np.nan), slopes)
 
@@ -365,7 +365,7 @@ class ForceTakeover:
                 since[i], slopes[rows] = state.time, slopes_here[rows]
         return replace(self, since=since, slopes=slopes)
 
-    def remaining(self, rigid_bodies: Sequence[RigidBody], bodies: Bodies, t: float) -> Array:
+    def differentiate_remaining(self, rigid_bodies: Sequence[RigidBody], bodies: Bodies, t: float) -> Array:
         """Derivatives (r - n, 3, p) of the part of the forces that is left at time ``t``."""
         shares = np.zeros(len(self.slopes))
         for body, since, rows in zip(rigid_bodies, self.since, bodies.own_rows, strict=True):

@@ -25,7 +25,7 @@ from .direction import refactor_at
 from .factor import Factor, find_touched_unknowns
 from .linear import prefers_multigrid
 from .newton import FIRST_DAMPING, Equilibrium, NewtonControl, compute_reaction_scale, equilibrate
-from .sensitivity import Explicit, ForceTakeover, MemoryDerivative
+from .sensitivity import ExplicitDerivative, ForceTakeover, MemoryDerivative
 from .start import IndenterStart, WarmStart, build_grips, compute_extrapolation, measure_indenter_travel
 
 # Penetration over the allowed one that a few more iterations will not mend; how often a penalty is raised.
@@ -77,7 +77,7 @@ class SteppedRun:
             self.system, moduli, control.linear_solver, threads, last=last, steps=len(self.planned)
         )
         # Multigrid is for one right-hand side: sensitivities have many, and want them exactly.
-        apart = sensitivities and not self.factor.lasting and not prefers_multigrid()
+        apart = sensitivities and not self.factor.is_lasting and not prefers_multigrid()
         self.slopes = self.factor
         if apart:
             self.slopes = Factor(self.system, moduli, threads=threads, lasting=True, last=last)
@@ -85,13 +85,13 @@ class SteppedRun:
         self.memory = Memory.rest(self.system, self.laws)
         self.slope = MemoryDerivative.rest(self.system, self.laws) if sensitivities else None
         self.damping = 0.0  # to begin a step with, after one that needed it
-        self.warm = WarmStart.of(problem, warm_start)
+        self.warm = WarmStart.from_result(problem, warm_start)
         widths = [body.shape.width for body in problem.rigid_bodies]
         width = min(widths, default=1.0)
         self.floor, self.pushing = REST_FORCE_SHARE * self.laws.modulus * width**2, False
         self.stiffness = 2000.0 / width if control.penalty is None else control.penalty
         self.deepest = control.penetration * measure_indenter_travel(self.system, self.laws.modulus)
-        self.touch = IndenterStart.of(problem)
+        self.touch = IndenterStart.from_problem(problem)
         drives = self.touch.shift_drives(problem.drives(0.0))
         rest = self.system.bodies.impose(np.zeros((self.system.rows, 3)), drives)
         still = np.zeros((*rest.shape, self.laws.count)) if sensitivities else None
@@ -103,7 +103,7 @@ class SteppedRun:
         self.states = [self._build_state(0.0, start, rest, self.stiffness, still, None, drives, self.grips)]
         self.takeover = None
         if still is not None:
-            self.takeover = ForceTakeover.none(problem.rigid_bodies, still[self.system.nodes :])
+            self.takeover = ForceTakeover.begin(problem.rigid_bodies, still[self.system.nodes :])
         self.reason, self.pace = "", StepController(control.max_iterations)
         self.unbalanced: list[tuple[float, float]] = []  # mm and residual of steps beyond the tolerance
         self.unsettled: list[tuple[float, float]] = []  # the same of steps whose grip goes on changing
@@ -272,7 +272,7 @@ class SteppedRun:
         return found
 
     def _predict(self, t: float) -> Array:
-        warm, last = self.warm.at(t), self.warm.at(self.states[-1].time)
+        warm, last = self.warm.interpolate(t), self.warm.interpolate(self.states[-1].time)
         if warm is not None:  # what it missed by in the step before, it will miss by in this one, by depth
             if last is None:
                 return warm
@@ -318,7 +318,7 @@ class SteppedRun:
         if self.touch.waits and increment.time >= self.problem.touch_down_s * (1.0 - 1e-9):
             self.touch = self.touch.touch_down(self.system, u, drives, du)
         tools = self.system.tools(u, replace(increment, drives=self.touch.shift_drives(drives)))
-        apart = [self.touch.relative_to_touch(self.system, du), *[du] * len(tools)]
+        apart = [self.touch.subtract_touch(self.system, du), *[du] * len(tools)]
         self.grips = tuple(g and g.advance(tool, d) for g, tool, d in zip(increment.grips, tools, apart))
         self.memory, self.stiffness = after, stiffness
         self.damping = FIRST_DAMPING if found.damped else 0.0
@@ -362,7 +362,7 @@ class SteppedRun:
     ) -> State:  # fmt: skip
         n = self.system.nodes
         slopes = (None, None) if du is None else (du[:n], du[n:])
-        grips = tuple(grip and grip.without_derivatives() for grip in holding)
+        grips = tuple(grip and grip.drop_derivatives() for grip in holding)
         return State(
             time, displacement, u[:n], stiffness, slopes[0], memory, u[n:], slopes[1], drives, grips,
             self.problem.activation_at(time),
@@ -378,7 +378,7 @@ class SteppedRun:
         return bool(np.isclose(t, self.problem.kinks, rtol=1e-9, atol=0.0).any())
 
     def _differentiate(
-        self, explicit: Explicit, found: Equilibrium, increment: Increment
+        self, explicit: ExplicitDerivative, found: Equilibrium, increment: Increment
     ) -> tuple[Array, Array]:
         """Derivatives (n, 3, p) of the displacement and (p,) of the force at equilibrium."""
         system, laws, at, u = self.system, self.laws, found.at, found.u
@@ -393,9 +393,9 @@ class SteppedRun:
             held = np.einsum("ij,fqip->fqjp", tool.body.frame, held).reshape(-1, 3, laws.count)  # in space
             change += tool.distribute_forces(held)
             if i == 0:
-                d_reaction -= system.bodies.first.frame[2] @ held.sum(axis=0)
+                d_reaction -= system.bodies.first_body.frame[2] @ held.sum(axis=0)
         if self.takeover is not None:
-            change[system.nodes :] -= self.takeover.remaining(
+            change[system.nodes :] -= self.takeover.differentiate_remaining(
                 self.problem.rigid_bodies, system.bodies, increment.time
             )
         coupling = Coupling(system, increment, u)

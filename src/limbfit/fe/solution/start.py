@@ -38,7 +38,7 @@ def measure_indenter_travel(system: System, modulus: float) -> float:
     bodies = system.problem.rigid_bodies
     if not bodies:
         return float(np.abs(system.problem.history.driver).max())
-    grown = [-one.surface.gaps_at_rest(one.start.grown(1.0)).min() for one in system.bodies.all
+    grown = [-one.surface.gaps_at_rest(one.start.grow(1.0)).min() for one in system.bodies.all
              if one.stated.motion.grows]  # fmt: skip
     if max(grown, default=0.0) > 0.0:
         return float(max(grown))
@@ -61,10 +61,10 @@ def build_grips(
         if friction in ("frictionless", 0.0):
             grips.append(None)
         elif isinstance(friction, str):
-            grips.append(Anchors.none(body.surface, parameters))
+            grips.append(Anchors.begin(body.surface, parameters))
         else:
             law = LAWS_OF_STICKING[body.stated.sticking]
-            grip = law.none(float(friction), body.surface, parameters, body.stated.holding)
+            grip = law.begin(float(friction), body.surface, parameters, body.stated.holding)
             grips.append(grip.start(tool))
     return tuple(grips)
 
@@ -99,7 +99,7 @@ class IndenterStart:
     slope: Array | None = None
 
     @classmethod
-    def of(cls, problem: Problem) -> IndenterStart:
+    def from_problem(cls, problem: Problem) -> IndenterStart:
         """The start of a simulation of a problem."""
         meets = problem.touch_down_s > 0.0 or (problem.prestretch is not None and problem.start == "touching")
         if problem.indenter is None or not meets:
@@ -108,14 +108,14 @@ class IndenterStart:
 
     def touch_down(self, system: System, u: Array, drives: Drives, du: Array | None) -> IndenterStart:
         """The start once it touches the tissue at ``u (r, 3)``, whose derivative is ``du (r, 3, p)``."""
-        body = system.bodies.first
+        body = system.bodies.first_body
         surface = replace(body.surface, points=body.surface.points + u[: system.nodes])
         offset = find_touching_offset(surface, body.start)
         if du is None:
             return IndenterStart(False, offset)
         moved = IndenterStart(False, offset).shift_drives(drives)
         tool = system.bodies.tools(u, moved)[0]
-        gaps, normals, _ = tool.body.local_distance(tool.local)
+        gaps, normals, _ = tool.body.local_distance(tool.local_points)
         at = np.unravel_index(gaps.argmin(), gaps.shape)
         normal = normals[at]
         return IndenterStart(False, offset, normal @ tool.relative_motion(du)[at] / normal[2])
@@ -134,17 +134,17 @@ class IndenterStart:
         """Derivative (c, 3, p) of the forces on the contact points through the offset alone, N."""
         if self.slope is None or at.touch is None:
             return None
-        points, axis = system.bodies.first.points, system.bodies.first.frame[2]
+        points, axis = system.bodies.first_body.points, system.bodies.first_body.frame[2]
         out = np.zeros((system.bodies.count, 3, len(self.slope)))
         stiff = (at.touch.blocks + coupling.blocks)[points]
         out[points] = -(stiff @ axis)[..., None] * self.slope
         return out
 
-    def relative_to_touch(self, system: System, du: Array | None) -> Array | None:
+    def subtract_touch(self, system: System, du: Array | None) -> Array | None:
         """Derivatives (r, 3, p) of displacements, relative to where the indenter touched."""
         if du is None or self.slope is None:
             return du
-        return du - system.bodies.first.frame[2][:, None] * self.slope
+        return du - system.bodies.first_body.frame[2][:, None] * self.slope
 
 
 SAME_S = 1e-9  # s: times of two simulations that differ by less are the same
@@ -179,7 +179,7 @@ class WarmStart:
     u: tuple[Array, ...]
 
     @classmethod
-    def of(cls, problem: Problem, result: Result | None) -> WarmStart:
+    def from_result(cls, problem: Problem, result: Result | None) -> WarmStart:
         """The states of a result on the same mesh, moved to the new parameters along their sensitivities."""
         rows = count_body_rows(problem.rigid_bodies)
         shapes = [(state.u.shape, len(state.coordinates)) for state in result.states[:1]] if result else []
@@ -197,7 +197,7 @@ class WarmStart:
         ]
         return cls(times, tuple(moved))
 
-    def at(self, t: float) -> Array | None:
+    def interpolate(self, t: float) -> Array | None:
         """Displacement (n, 3) at a time, linear between the states; None outside of them."""
         if not len(self.times) or not self.times[0] - SAME_S <= t <= self.times[-1] + SAME_S:
             return None

@@ -118,7 +118,7 @@ def solve(
 
 def _take_snapshot(run: SteppedRun, rows: list[Step], seconds: float) -> Snapshot:
     """All that the further steps of a run, and its result, depend on."""
-    return Snapshot.of(
+    return Snapshot.from_values(
         states=[replace(state, memory=None, grips=()) for state in run.states],
         driven=[body.motion.values for body in run.problem.bodies],
         grips=run.grips,
@@ -268,7 +268,7 @@ class Snapshot:
     arrays: Mapping[str, NDArray[Any]]
 
     @classmethod
-    def of(cls, **values: Any) -> Snapshot:
+    def from_values(cls, **values: Any) -> Snapshot:
         """Of dataclasses, sequences, arrays and plain values; what is in something is named after a dot."""
         facts: dict[str, Any] = {}
         arrays: dict[str, NDArray[Any]] = {}

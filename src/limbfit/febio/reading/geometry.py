@@ -73,7 +73,7 @@ def read_geometry(root: XmlNode, materials: Iterable[str]) -> Geometry:
     Raises `ProblemError` for a node, element, set or material that does not exist or is there twice.
     """
     mesh = root.child("Mesh")
-    nodes = [node for group in mesh.all("Nodes") for node in group]
+    nodes = [node for group in mesh.find_all("Nodes") for node in group]
     if not nodes:
         raise mesh.error("has no nodes")
     numbers = _NodeNumbers(nodes)
@@ -99,7 +99,7 @@ def read_geometry(root: XmlNode, materials: Iterable[str]) -> Geometry:
         name: np.array(numbers.look_up(group, _read_ids(group, most)), dtype=np.int64)
         for name, group in _find_named(mesh, "NodeSet")
     }
-    named = [group for group in mesh.all("Nodes") if group.attributes.get("name")]
+    named = [group for group in mesh.find_all("Nodes") if group.attributes.get("name")]
     blocks = {
         group.attributes["name"]: np.array(numbers.look_up(group, _read_identities(group))) for group in named
     }
@@ -134,7 +134,7 @@ class _NodeNumbers:
 
 def _find_named(mesh: XmlNode, tag: str) -> list[tuple[str, XmlNode]]:
     found: dict[str, XmlNode] = {}
-    for group in mesh.all(tag):
+    for group in mesh.find_all(tag):
         name = group.attribute("name")
         if name in found:
             raise group.error(f"{name!r} is there twice")

@@ -15,7 +15,7 @@ import numpy as np
 
 from ...arrays import Array
 from ...errors import ProblemError
-from ...fe import Contractile, Fibred, Material, MooneyRivlin, NeoHookean, Ogden, OgdenQLV
+from ...fe import ContractileMaterial, FibredMaterial, Material, MooneyRivlin, NeoHookean, Ogden, OgdenQLV
 from ...fe.materials import Uncoupled
 from .geometry import Part
 from .timing import LoadCurve, read_curve_number
@@ -113,7 +113,7 @@ def _read_uncoupled(node: XmlNode, around: _Surroundings) -> Material:
     if kind not in (*ELASTIC, MIXTURE):
         raise _build_kind_error(node, kind)
     if kind == MIXTURE:
-        active = [one for one in node.all("solid") if one.attribute("type") == ACTIVE]
+        active = [one for one in node.find_all("solid") if one.attribute("type") == ACTIVE]
         if active:
             return _read_contractile(node, active, around)
     return _read_hyperelastic(node, around)
@@ -140,14 +140,14 @@ def _check_volumetric(inner: XmlNode, around: _Surroundings) -> None:
         raise inner.error("its pressure_model differs from that of the material around it")
 
 
-def _read_contractile(node: XmlNode, active: list[XmlNode], around: _Surroundings) -> Contractile:
+def _read_contractile(node: XmlNode, active: list[XmlNode], around: _Surroundings) -> ContractileMaterial:
     """Read what a mixture bears passively, and the stress of its fibres at full activation."""
     if len(active) > 1:
         raise active[1].error("a mixture is read with one contraction")
     _check_parameters(node, {"solid"} | _SHARED)
     (active_stress,) = active
     _check_parameters(active_stress, {"smax", "activation", "k", "density"})
-    rest = [one for one in node.all("solid") if one is not active_stress]
+    rest = [one for one in node.find_all("solid") if one is not active_stress]
     if [one.attribute("type") for one in rest] == [RELAXED]:
         _check_volumetric(rest[0], around)
         passive = _read_relaxing(rest[0], around)
@@ -155,10 +155,10 @@ def _read_contractile(node: XmlNode, active: list[XmlNode], around: _Surrounding
         passive = _read_elastic(rest[0], around)
     else:
         passive = _read_mixture(node, rest, around)
-    if not isinstance(passive, Fibred):
+    if not isinstance(passive, FibredMaterial):
         assert isinstance(passive, Uncoupled)
-        passive = Fibred(passive, 0.0, 1.0)
-    return Contractile(passive, active_stress.number("smax") * active_stress.number("activation"))
+        passive = FibredMaterial(passive, 0.0, 1.0)
+    return ContractileMaterial(passive, active_stress.number("smax") * active_stress.number("activation"))
 
 
 def _read_hyperelastic(node: XmlNode, around: _Surroundings) -> Material:
@@ -166,10 +166,10 @@ def _read_hyperelastic(node: XmlNode, around: _Surroundings) -> Material:
     if node.attribute("type") != MIXTURE:
         return _read_elastic(node, around)
     _check_parameters(node, {"solid"} | _SHARED)
-    return _read_mixture(node, node.all("solid"), around)
+    return _read_mixture(node, node.find_all("solid"), around)
 
 
-def _read_mixture(node: XmlNode, solids: list[XmlNode], around: _Surroundings) -> Fibred:
+def _read_mixture(node: XmlNode, solids: list[XmlNode], around: _Surroundings) -> FibredMaterial:
     """Read the ground and the fibres among the ``solids`` of a mixture."""
     fibres = [one for one in solids if one.attribute("type") == FIBRE]
     grounds = [one for one in solids if one.attribute("type") in ELASTIC]
@@ -187,7 +187,8 @@ def _read_mixture(node: XmlNode, solids: list[XmlNode], around: _Surroundings) -
         raise stated.error("fibres run along the first of the local axes", "state it as mat_axis")
     if fibre.number("beta") != 2.0:
         raise fibre.child("beta").error("limbfit's fibres have beta = 2")
-    return Fibred(_read_elastic(ground, around), around.scale * fibre.number("ksi"), fibre.number("alpha"))
+    base = _read_elastic(ground, around)
+    return FibredMaterial(base, around.scale * fibre.number("ksi"), fibre.number("alpha"))
 
 
 def _build_kind_error(node: XmlNode, kind: str) -> ProblemError:

@@ -65,9 +65,9 @@ class LoadCurve:
             rounds = np.where((t >= x[0]) & (t <= x[-1]), 0.0, rounds)
             t = t - rounds * span
             offset = rounds * (y[-1] - y[0]) * (self.extend == "REPEAT OFFSET")
-        inside = self._between(np.clip(t, x[0], x[-1]))
+        inside = self._interpolate(np.clip(t, x[0], x[-1]))
         if self.extend == "EXTRAPOLATE":
-            inside = inside + self._beyond(t)
+            inside = inside + self._extrapolate(t)
         return np.asarray(inside + offset)
 
     def shift(self, seconds: float) -> LoadCurve:
@@ -84,7 +84,7 @@ class LoadCurve:
             return np.asarray(self.points[:, 0])
         return None
 
-    def _between(self, t: Array) -> Array:
+    def _interpolate(self, t: Array) -> Array:
         x, y = self.points.T
         if self.interpolate == "LINEAR" or (self.interpolate == "SMOOTH" and len(x) == 2):
             return np.asarray(np.interp(t, x, y))
@@ -108,14 +108,14 @@ class LoadCurve:
             + h * (t - b) * (t - a) / ((c - b) * (c - a))
         )
 
-    def _beyond(self, t: Array) -> Array:
+    def _extrapolate(self, t: Array) -> Array:
         """Return what the last slope adds before the first and after the last point."""
         x = self.points[:, 0]
         if self.interpolate in ("STEP", "SMOOTH STEP"):
             return np.zeros(t.shape)
         straight, tiny = self.interpolate == "LINEAR", 0.001 * (x[-1] - x[0])
         ends = np.array([x[0], x[1] if straight else x[0] + tiny, x[-2] if straight else x[-1] - tiny, x[-1]])
-        a, b, c, d = self._between(ends)
+        a, b, c, d = self._interpolate(ends)
         low, high = (b - a) / (ends[1] - ends[0]), (d - c) / (ends[3] - ends[2])
         return np.asarray(low * np.minimum(t - x[0], 0.0) + high * np.maximum(t - x[-1], 0.0))
 

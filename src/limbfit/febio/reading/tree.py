@@ -48,13 +48,13 @@ class XmlNode:
         """Return the error that says what is wrong here."""
         return ProblemError(what, place=self.place, remedy=remedy)
 
-    def all(self, tag: str) -> list[XmlNode]:
+    def find_all(self, tag: str) -> list[XmlNode]:
         """Return the children of that name."""
         return [child for child in self.children if child.tag == tag]
 
     def find(self, tag: str) -> XmlNode | None:
         """Return the one child of that name, if there is one."""
-        found = self.all(tag)
+        found = self.find_all(tag)
         if len(found) > 1:
             raise found[1].error("is there twice")
         return found[0] if found else None

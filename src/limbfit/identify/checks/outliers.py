@@ -89,12 +89,12 @@ class LeaveOutFits:
 
     def fit_without(self, *left_out: int) -> Array:
         """Return the parameters (p,) of the fit without the sites of some records."""
-        key = self._of_sites(left_out)
+        key = self._expand_to_sites(left_out)
         if key not in self._fits:
             self._fits[key] = self._fit([i for i in range(len(self.measured)) if i not in key])
         return self._fits[key]
 
-    def _of_sites(self, indices: Sequence[int]) -> tuple[int, ...]:
+    def _expand_to_sites(self, indices: Sequence[int]) -> tuple[int, ...]:
         """Return all records of the sites of some records."""
         sites = {self.measured[i].site_name for i in indices}
         return tuple(i for i, one in enumerate(self.measured) if one.site_name in sites)
@@ -156,7 +156,7 @@ class LeaveOutFits:
 
     def compute_expected_error(self, *left_out: int) -> float:
         """Return the root mean square error of sites predicted without themselves and ``left_out``."""
-        out = self._of_sites(left_out)
+        out = self._expand_to_sites(left_out)
         rest = [j for j in range(len(self.measured)) if j not in out]
         errors = [self.compute_errors(self.fit_without(*left_out, j))[j] for j in rest]
         return max(float(np.sqrt(np.mean(np.square(errors)))), MIN_ERROR_SHARE)

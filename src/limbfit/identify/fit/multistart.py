@@ -46,7 +46,7 @@ class MultistartResult:
     starts: tuple[StartResult, ...]
 
     @property
-    def reached(self) -> int:
+    def reached_count(self) -> int:
         """The number of starts that ended at a fit as good as the best, or in its place."""
         return sum(start.same for start in self.starts)
 

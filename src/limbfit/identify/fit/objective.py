@@ -145,13 +145,13 @@ def find_new_warnings(
     If ``before`` is empty, every slip and fold is new.
     """
 
-    def first(kind: str) -> str:
+    def find_first(kind: str) -> str:
         known = [getattr(one, kind) for one in before] or [""] * len(measured)
         rows = zip(measured, responses, known, strict=True)
         new = (f"{m.name}: {getattr(r, kind)}" for m, r, old in rows if getattr(r, kind) and not old)
         return next(new, "")
 
-    return first("slipped"), first("folded")
+    return find_first("slipped"), find_first("folded")
 
 
 def compute_residuals(

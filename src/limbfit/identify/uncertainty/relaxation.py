@@ -95,7 +95,7 @@ class RelaxationAssessment:
     spread: RelaxationSpread
 
     @property
-    def preferred(self) -> str:
+    def preferred_model(self) -> str:
         """Which relaxation the records prefer, if they tell."""
         if abs(self.evidence) < _STRONG_EVIDENCE:
             return UNDECIDED
@@ -125,8 +125,8 @@ class RelaxationAssessment:
             POWER_LAW: f"{longest} prefer relaxation as a power of time to that of the model",
             UNDECIDED: f"{longest} cannot tell the relaxation of the model from a power law of time",
         }
-        found = [f"{preferred[self.preferred]} (2 ln B = {abs(self.evidence):.0f})"]
-        if self.preferred in (FURTHER, POWER_LAW) and self.tail_weight > _MIN_WEIGHT:
+        found = [f"{preferred[self.preferred_model]} (2 ln B = {abs(self.evidence):.0f})"]
+        if self.preferred_model in (FURTHER, POWER_LAW) and self.tail_weight > _MIN_WEIGHT:
             found.append(GIVES_WAY)
         for number, tissue in enumerate(self.tissues):
             modulus, (low, high) = self.state_modulus(number, LONG_TERM_S)
@@ -145,7 +145,7 @@ class RelaxationAssessment:
                 LongTermModulus(tissue=tissue.name, time_s=time, modulus_kPa=value, interval_95=(low, high))
             )
         return RelaxationSummary(
-            prefers=self.preferred,
+            prefers=self.preferred_model,
             evidence=self.evidence,
             tail_weight=self.tail_weight,
             words=self.describe(),
@@ -369,7 +369,7 @@ class _ForceRecords:
         for tissue in self.tissues:
             elastic = [*tissue.moduli, *tissue.others]
             found[elastic] = np.log(p[elastic])
-            found[list(tissue.moduli)] += np.log(relaxation.terms(tissue, p).at(duration_s))
+            found[list(tissue.moduli)] += np.log(relaxation.terms(tissue, p).evaluate(duration_s))
         return found
 
 

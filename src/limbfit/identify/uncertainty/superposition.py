@@ -33,7 +33,7 @@ class RelaxationTerms:
     amplitudes: Array
     times_s: Array
 
-    def at(self, time_s: float) -> float:
+    def evaluate(self, time_s: float) -> float:
         return self.constant + float(self.amplitudes @ np.exp(-time_s / self.times_s))
 
 
@@ -58,7 +58,7 @@ class TissueParameters:
 
     def modulus_log(self, p: Array, time_s: float) -> float:
         """Logarithm of the model's modulus so long after a step."""
-        return float(np.log(p[self.moduli[0]] * self.own_terms(p).at(time_s)))
+        return float(np.log(p[self.moduli[0]] * self.own_terms(p).evaluate(time_s)))
 
 
 def find_tissue_parameters(names: Sequence[str], space: SearchSpace) -> tuple[TissueParameters, ...]:

@@ -13,7 +13,7 @@ from pydantic import ValidationError
 
 from ... import acquire
 from ..._version import __version__
-from ...acquire.virtual import Fault, Serving, Surrogate, VirtualFitSocket, VirtualLimb, fit_surrogate, serve
+from ...acquire.virtual import Endpoint, Fault, Surrogate, VirtualFitSocket, VirtualLimb, fit_surrogate, serve
 from ...errors import InputError, TraceError, add_location
 from ...results.base import read_curves
 from ...results.limb import TracesResult
@@ -94,7 +94,7 @@ def acquire_site(
         "unreachable": list(session.unreachable),
         "samples": session.samples,
         "lost": session.lost,
-        "refused": asdict(device.refused),
+        "refused": asdict(device.refusals),
         "depth_mm": (ending.depth_um - ending.touch_um) / 1000 if ending.is_completed else None,
     }
     return found | _store_ramps(study, one, folder, ending.is_completed)
@@ -288,8 +288,8 @@ def _read_surrogate(file: Path, column: str) -> Surrogate:
 
 
 def serve_fitsocket(
-    device: VirtualFitSocket, serving: Serving, *, speed: float = 1.0, tell: Callable[[str], None]
+    device: VirtualFitSocket, serving: Endpoint, *, speed: float = 1.0, tell: Callable[[str], None]
 ) -> None:
-    """Serve a virtual device until `Serving.stop`; its thread asks for real-time priority."""
+    """Serve a virtual device until `Endpoint.stop`; its thread asks for real-time priority."""
     tell(f"priority: {acquire.prioritise()}")
     serve(device, serving, speed=speed, tell=tell)

@@ -96,7 +96,7 @@ def _read_geometry(study: Study) -> tuple[LimbGeometry | None, tuple[str, ...] |
     if store.stamp("sites") is None:  # then there is no need to read every image for its digest
         return None, bones, facts
     are_placed = store.state("sites", compute_keys(study, "sites")["sites"]).state == "done"
-    return LimbGeometry.stored(store) if are_placed else None, bones, facts
+    return LimbGeometry.from_store(store) if are_placed else None, bones, facts
 
 
 def _describe_indenters(study: Study) -> Iterator[str]:
@@ -139,7 +139,7 @@ def _describe_clamps(study: Study, limb: LimbGeometry | None) -> Iterator[str]:
     pins = study.clamps
     if pins is None:
         return
-    said = f"clamps: {len(pins.angles)} pins of {pins.force_N:g} N, {pins.begun_s:g} s before touch-down"
+    said = f"clamps: {len(pins.angles)} pins of {pins.force_N:g} N, {pins.lead_s:g} s before touch-down"
     if limb is None:
         yield f"{said}; they are placed after limbfit run --until sites"
     else:

@@ -38,14 +38,14 @@ def make_phantom_study(
     """
     with compile_in_background() as compiled, make_executor(workers) as executor:
 
-        def mapping(function: Callable, jobs: Iterable) -> Iterable:
+        def map_jobs(function: Callable, jobs: Iterable) -> Iterable:
             if function is simulate_true_force:
                 compiled()
             return executor.map(function, jobs)
 
         return make_phantom(
             Path(folder),
-            mapping=mapping,
+            mapping=map_jobs,
             progress=lambda text, done, total: listener(Progress(f"phantom {text}", done, total)),
             **options,
         )

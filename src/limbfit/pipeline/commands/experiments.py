@@ -173,7 +173,7 @@ def compute_experiment_key(
     """
     if options.get("parameters_from") == IDENTIFIED:
         experiment = replace(experiment, needs=(*experiment.needs, "calibrate"))
-    return keys.of(experiment, below, options)
+    return keys.compute_key(experiment, below, options)
 
 
 def list_experiment_states(

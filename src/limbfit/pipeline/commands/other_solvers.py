@@ -111,8 +111,8 @@ def check_export(
             model = _build_block_model(study, one, file)
             problem = build_problem(model, block, used)
             if study.clamps is not None:
-                later = problem.history.delay(study.clamps.begun_s)
-                problem = replace(problem, history=later, touch_down_s=study.clamps.begun_s)
+                later = problem.history.delay(study.clamps.lead_s)
+                problem = replace(problem, history=later, touch_down_s=study.clamps.lead_s)
             prepared = PreparedIndentation(context, one, model, used, origin)
             with name_file_in_errors(study.file, about=f"{one.name}: "):
                 _write(prepared, problem, to, Path(folder), _NO_CURVE)
@@ -184,7 +184,7 @@ def _build_ranges(prepared: PreparedIndentation, tissues: Sequence[str]) -> dict
     ranges = {}
     for tissue in tissues:
         start = prepared.parameters[tissue]
-        lower, upper = (study.material.of(tissue, bound) for bound in ("lower", "upper"))
+        lower, upper = (study.material.get(tissue, bound) for bound in ("lower", "upper"))
         for key, value in start.items():
             if not lower[key] <= value <= upper[key]:
                 what = f"{tissue}.{key} = {value:g} lies outside its bounds, {lower[key]:g} to {upper[key]:g}"

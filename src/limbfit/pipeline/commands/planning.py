@@ -288,7 +288,7 @@ def choose_tissues(
     """
     if given or (not literature and Store(study.results).stamp("calibrate") is not None):
         return choose_parameters(study, given)
-    values = {tissue: dict(study.material.of(tissue, "start")) for tissue in study.tissues}
+    values = {tissue: dict(study.material.get(tissue, "start")) for tissue in study.tissues}
     origin = "start of the study"
     others = {one: NONE for one in study.tissues if one not in TISSUES}
     medians = of_tissues(study.tissues, others | study.calibration.prior_tissues)

@@ -128,10 +128,10 @@ def _compute_chain(keys: Keys, until: str = "report") -> dict[str, StageKey]:
             shown += [compute_file_digest(models)] if models.is_file() else []
             options = {"experiments": shown} if shown else {}
         if stage.name == "sites":  # where they are decides their meshes, and not what else is said of them
-            placed = {"sites": keys.of(stage, below, study=unlabelled).digest}
-        key = keys.of(stage, below | placed if stage.name == "mesh" else below, options)
+            placed = {"sites": keys.compute_key(stage, below, study=unlabelled).digest}
+        key = keys.compute_key(stage, below | placed if stage.name == "mesh" else below, options)
         if "calibrate" not in below:
-            key_alone = keys.of(stage, alone, study=fitted)
+            key_alone = keys.compute_key(stage, alone, study=fitted)
             alone[stage.name] = key_alone.digest
             key = key_alone if stage.name == "calibrate" else key
         chain[stage.name], below[stage.name] = key, key.digest
@@ -230,7 +230,7 @@ def _check_limb(context: Context, check: Callable[[LimbGeometry], None] | None, 
     study, store = context.study, context.store
     if not (meshing or check):
         return
-    limb = LimbGeometry.stored(store)
+    limb = LimbGeometry.from_store(store)
     if meshing:
         facts = store.results.traces.sites
         moving = [one for one in study.recorded if (seen := facts[one.name].surface) and seen.compared]
@@ -401,7 +401,7 @@ def report_study(study: Study, *, listener: Listener = ignore_progress) -> dict[
         chain, predicted = _compute_chain(keys), context.store.stamp("predict")
         key = chain["report"]
         if predicted is None or predicted.key != chain["predict"].digest:
-            key = keys.of(STAGES[-1], {} if predicted is None else {"predict": predicted.key})
+            key = keys.compute_key(STAGES[-1], {} if predicted is None else {"predict": predicted.key})
         _do(context, STAGES[-1], key)
         return summarise(study, STAGE_NAMES)
 

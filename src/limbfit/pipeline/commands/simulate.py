@@ -164,7 +164,7 @@ def _compare_with_records(
     stored = read_recorded_range(prepared.study) if prepared.origin == IDENTIFIED else None
     if stored is None:
         return {"outside_records": None, "outside_text": []}
-    tested, limb = RecordedRange.from_stored(stored), LimbGeometry.stored(prepared.context.store)
+    tested, limb = RecordedRange.from_stored(stored), LimbGeometry.from_store(prepared.context.store)
     rows = tested.find_outside(
         describe_indentation(
             LoadHistory.from_knots(model.knots_s, model.knots_N or model.knots_mm),
@@ -211,7 +211,7 @@ def choose_parameters(study: Study, given: Parameters | None = None) -> tuple[Pa
             raise InputError(what, remedy=f"give all of them for each of {', '.join(study.tissues)}")
         return given, "given"
     if store.stamp("calibrate") is None:
-        start = {tissue: study.material.of(tissue, "start") for tissue in study.tissues}
+        start = {tissue: study.material.get(tissue, "start") for tissue in study.tissues}
         return start, "start of the study"
     if store.state("calibrate", compute_keys(study, "calibrate")["calibrate"]).state != "done":
         raise InputError(

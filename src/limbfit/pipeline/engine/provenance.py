@@ -99,15 +99,15 @@ def record_settings(study: Study, digests: Mapping[str, str]) -> dict[str, Any]:
     """
     by_path = {path: f"sha256:{digests[key][:16]}" for key, path in study.inputs.items()}
 
-    def plain(value: Any) -> Any:
+    def to_plain(value: Any) -> Any:
         if isinstance(value, Path):
             # Of `febio.program`, which is no input, the name alone: each machine has it elsewhere.
             return by_path.get(value, f"sha256:{compute_digest(value.name)}")
         if isinstance(value, dict):
-            return {key: plain(part) for key, part in value.items()}
-        return [plain(part) for part in value] if isinstance(value, list | tuple) else value
+            return {key: to_plain(part) for key, part in value.items()}
+        return [to_plain(part) for part in value] if isinstance(value, list | tuple) else value
 
-    record = plain(study.model_dump())
+    record = to_plain(study.model_dump())
     for key in ("series", "markers_series"):
         if record["image"] and record["image"][key]:
             record["image"][key] = f"sha256:{compute_digest(record['image'][key])}"
@@ -167,7 +167,7 @@ class Keys:
         own = compute_extensions_digest(study.extensions)  # they may change what any stage does
         self._code = {"limbfit": __version__} | ({"study.extensions": own} if own else {})
 
-    def of(
+    def compute_key(
         self,
         stage: Stage,
         below: Mapping[str, str],

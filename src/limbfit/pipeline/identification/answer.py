@@ -212,7 +212,7 @@ def estimate_linearised(
     return estimate_uncertainty(
         parameters,
         responses,
-        simulator.records.measured,
+        simulator.records.curves,
         problem.unknowns,
         noise,
         problem.stages[-1],
@@ -252,7 +252,7 @@ def sample_intervals(
     if not moves or sampled.method == LINEARISED:
         return found, sampled
     responses = simulate(sampled.parameters)
-    answer = move_answer(found, sampled.parameters, records.measured, responses, problem.unknowns)
+    answer = move_answer(found, sampled.parameters, records.curves, responses, problem.unknowns)
     if isinstance(answer, Calibration):
         return answer, sampled
     simulator.report(f"warning: {NOT_MOVED}: {answer}")

@@ -141,7 +141,7 @@ def _summarise_starts(tried: MultistartResult, problem: CalibrationProblem) -> s
         vectors = {"start": study.by_tissue(np.array(one.start)), "parameters": found}
         starts.append(stored.SearchStart(**vars(one) | vectors))
     return stored.SearchStarts(
-        summary=describe_starts(tried, problem.unknowns.names), reached=tried.reached, starts=starts
+        summary=describe_starts(tried, problem.unknowns.names), reached=tried.reached_count, starts=starts
     )
 
 

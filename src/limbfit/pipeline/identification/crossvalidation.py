@@ -90,7 +90,7 @@ def run_crossvalidate(
     problem = replace(problem, unknowns=problem.unknowns.with_start(best))
     records = load_records(context, study.records_at(*recorded), secondary=True)
     cache, report = open_experiment_cache(context, folder), partial(context.tell, "crossvalidate", 0, 0)
-    simulator, measured = RecordSimulator(problem, records, cache, context.executor, report), records.measured
+    simulator, measured = RecordSimulator(problem, records, cache, context.executor, report), records.curves
     sites: dict[str, tuple[int, ...]] = {}
     for i, one in enumerate(measured):
         sites[one.site_name] = (*sites.get(one.site_name, ()), i)
@@ -332,7 +332,7 @@ def _fit_region(
         jobs = [record.own_job(parameters) if apart else record.job(parameters) for record in judged]
         return [to_response(one) for one in cache.run(jobs, context.executor)]
 
-    measured = [record.measured for record in judged]
+    measured = [record.curve for record in judged]
     of_whole, start = compute_site_errors(simulate, whole, measured), problem.unknowns.with_start(whole)
     found = search_parameters(simulator, start, problem.stages[-1:]).calibration
     own = compute_site_errors(simulate, found.parameters, measured)

@@ -46,10 +46,10 @@ _MISSING = {
 def run_predict(context: Context, folder: Path) -> None:
     """Force at every recorded site with all materials and with one, intervals, and the fields at the peak."""
     study, calibration = context.study, context.results.calibration
-    answers = [Answer.of(stage, study) for stage in calibration.stages]
+    answers = [Answer.from_stage(stage, study) for stage in calibration.stages]
     one, best = answers[0].parameters, answers[-1].parameters
     known = PredictionModel.from_stored(calibration.uncertainty)
-    records, limb = load_records(context, study.recorded), LimbGeometry.stored(context.store)
+    records, limb = load_records(context, study.recorded), LimbGeometry.from_store(context.store)
     earlier = [context.store[stage] / "runs" for stage in ("calibrate", "predict")]
     cache = SimulationCache(folder / "runs", also=earlier)
     jobs = build_answer_jobs(records, answers[-1])
@@ -95,7 +95,7 @@ class Answer:
     starts: tuple[Array, ...]
 
     @classmethod
-    def of(cls, stage: stored.SearchStage, study: Study) -> Answer:
+    def from_stage(cls, stage: stored.SearchStage, study: Study) -> Answer:
         """The answer of a stage as ``calibration.json`` holds it."""
         starts = stage.iterations[-1].starts
         return cls(study.vector(stage.parameters), tuple(study.vector(one) for one in starts))
@@ -146,7 +146,7 @@ class SitePrediction:
     one: SiteResponse | None
 
     @property
-    def missing(self) -> dict[str, str]:
+    def missing_reasons(self) -> dict[str, str]:
         """What is not predicted, and why."""
         found = {} if self.ours.completed else {"interval": self.ours.reason}
         if not self.own.completed:
@@ -159,7 +159,7 @@ class SitePrediction:
     def warnings(self) -> list[str]:
         """What is doubtful or missing."""
         doubts = self.ours.warnings if self.ours.completed else self.own.warnings
-        return [*doubts, *(f"{_MISSING[what]}: {reason}" for what, reason in self.missing.items())]
+        return [*doubts, *(f"{_MISSING[what]}: {reason}" for what, reason in self.missing_reasons.items())]
 
 
 def _simulate_records(
@@ -259,7 +259,7 @@ def _compute_band(study: Study, site: SitePrediction, best: Array, known: Predic
 
 def _write_curves(folder: Path, site: SitePrediction, band: _Band | None) -> None:
     """The record beside its prediction; a column that is not predicted is not there."""
-    record, missing = site.record, site.missing
+    record, missing = site.record, site.missing_reasons
     name, driven, driving = "force", "displacement_mm", record.displacement_mm
     if record.record.forced:
         name, driven, driving = "displacement", "force_N", record.force_N
@@ -381,7 +381,7 @@ def _summarise_site(
         penetration_mm=own.penetration_mm,
         completed=own.completed,
         reason=own.reason,
-        not_predicted=site.missing,
+        not_predicted=site.missing_reasons,
         warnings=site.warnings,
         doubts=[stored.SimulationDoubt.model_validate(doubt) for doubt in own.doubts],
         steps=own.facts["steps"],

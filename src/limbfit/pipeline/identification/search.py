@@ -114,12 +114,12 @@ def is_moved(study: Study) -> bool:
 def build_unknowns(study: Study) -> Unknowns:
     """The parameters of each tissue with the study's start and bounds."""
 
-    def flat(which: Literal["start", "lower", "upper"]) -> Array:
-        return study.vector({tissue: study.material.of(tissue, which) for tissue in study.tissues})
+    def flatten(which: Literal["start", "lower", "upper"]) -> Array:
+        return study.vector({tissue: study.material.get(tissue, which) for tissue in study.tissues})
 
     names = tuple(f"{tissue}.{name}" for tissue, name in study.parameters)
     priors = tuple(Prior(name, p.median, p.factor) for name, p in study.priors.items())
-    return Unknowns(names, flat("start"), flat("lower"), flat("upper"), priors)
+    return Unknowns(names, flatten("start"), flatten("lower"), flatten("upper"), priors)
 
 
 def build_groupings(study: Study) -> tuple[Grouping, ...]:
@@ -296,11 +296,11 @@ def _search_once(simulator: RecordSimulator, start: Unknowns, stages: Sequence[G
 
     if not records.is_coarsened:
         found = calibrate(
-            simulator.search, records.measured, start, problem.settings, stages=stages, on_iterate=report
+            simulator.search, records.curves, start, problem.settings, stages=stages, on_iterate=report
         )
         return SearchResult(found)
     return calibrate_with_correction(
-        simulator.search, simulator.check, records.measured, start, problem.settings,
+        simulator.search, simulator.check, records.curves, start, problem.settings,
         CorrectionSettings(table.corrections, table.correction_tolerance_percent),
         stages=stages, on_iterate=report,
     )  # fmt: skip

@@ -38,7 +38,7 @@ def read_record_warnings(study: Study, store: Store, limb: LimbGeometry) -> tupl
 
 def tell_flags(context: Context) -> None:
     """Warn of what is wrong with records before parameters are identified from them."""
-    limb = LimbGeometry.stored(context.store)
+    limb = LimbGeometry.from_store(context.store)
     for flag in read_record_warnings(context.study, context.store, limb):
         context.tell("calibrate", 0, 0, f"warning: {flag.text}")
 
@@ -169,7 +169,7 @@ def check_records(
 
     found = find_outliers(
         simulate,
-        [replace(record.measured, weight=1.0 / record.record.of_site) for record in records],
+        [replace(record.curve, weight=1.0 / record.record.of_site) for record in records],
         best,
         [(record.times_s, record.displacement_mm) for record in records],
         simulate_exchange,

@@ -92,7 +92,7 @@ class SiteRecord:
         return self.record.site
 
     @property
-    def measured(self) -> MeasuredCurve:
+    def curve(self) -> MeasuredCurve:
         """What the calibration compares with."""
         weight = self.record.weight * (1.0 if self.seen is None else self.seen.weight(self.error_share))
         doubt = None
@@ -122,7 +122,7 @@ class SiteRecord:
         """What this record would show of a simulation."""
         plain = to_response(simulation)
         if self.seen is not None:
-            values, slopes = self.seen.of(simulation)
+            values, slopes = self.seen.observe(simulation)
             return replace(plain, force_N=values, jacobian=slopes)
         force_N, jacobian = (self.smoothing @ values for values in (plain.force_N, plain.jacobian))
         return replace(plain, force_N=force_N, jacobian=jacobian)
@@ -171,9 +171,9 @@ class RecordSet:
         return self.searched is not self.own
 
     @property
-    def measured(self) -> list[MeasuredCurve]:
+    def curves(self) -> list[MeasuredCurve]:
         """What the calibration compares with."""
-        return [record.measured for record in self.own]
+        return [record.curve for record in self.own]
 
     @property
     def simulations(self) -> int:
@@ -301,11 +301,11 @@ def estimate_site_deviation(
     """One standard deviation (n,) of what a record would be off by, as its site's tissue were stiffer.
 
     In N, or mm where the record compares depths, from the derivatives at ``parameters`` (p,). What thinner
-    tissue is strained more by shows in what is seen of it (`SecondaryValues.by_strain`), not in its moduli.
+    tissue is strained more by shows in what is seen of it (`SecondaryValues.strain_slope`), not in moduli.
     """
     stiffer = np.asarray(response.jacobian @ (parameters * is_modulus(study)))
     surface_mm, thickness_mm = record.surface_error_mm, measure_bone_distance_mm(record.model)
-    strained = None if record.seen is None else record.seen.by_strain(response.force_N)
+    strained = None if record.seen is None else record.seen.strain_slope(response.force_N)
     if strained is None or thickness_mm is None:
         return stiffer * compute_expected_share(record.model, surface_mm)
     return stiffer * LEAST_SHARE + strained * surface_mm / thickness_mm

@@ -33,7 +33,7 @@ from ...mesh import read_vtu
 from ...results.base import read_curves
 from ...results.limb import LayerRecord, TraceFacts, WaveRecord
 from ...study import Record, Study, Vector
-from ...traces import SurfaceMotion, Thinning, WaveMeans
+from ...traces import LayerThinning, SurfaceMotion, WaveMeans
 from ...traces.numerics import build_linear_interpolation
 from ..engine.store import LAYERS, WAVES, write_curves
 
@@ -67,7 +67,7 @@ class SecondaryValues:
     quantity: ClassVar[str]  # in the heads of stored curves
     unit: ClassVar[str] = "mm"
 
-    def of(self, simulation: Simulation) -> tuple[Array, Array]:
+    def observe(self, simulation: Simulation) -> tuple[Array, Array]:
         """The same values (n,) of a simulation, and their derivatives (n, p); none: (n, 0)."""
         values = np.einsum("nt,nt->n", self.at, simulation.observed[self.gauge])
         slopes = simulation.observed_jacobian
@@ -98,23 +98,23 @@ class SecondaryValues:
         """
         covariance = self.covariance
         if depth_mm is not None:
-            slope = touch_down_sd_mm * self.by_depth(self.at @ depth_mm, simulated)
+            slope = touch_down_sd_mm * self.depth_slope(self.at @ depth_mm, simulated)
             covariance = covariance + np.outer(slope, slope)
         sd = self.facts["sd"]
         return SiteNoise(
-            name, self.time_s, covariance, sd, 0.0, touch_down_sd_mm, self.unit, similarity=self.alike
+            name, self.time_s, covariance, sd, 0.0, touch_down_sd_mm, self.unit, similarity=self.similarity
         )
 
     @property
-    def alike(self) -> Array | None:
+    def similarity(self) -> Array | None:
         """See `SiteNoise.similarity`."""
         return None
 
-    def by_depth(self, depth_mm: Array, simulated: Array) -> Array:
+    def depth_slope(self, depth_mm: Array, simulated: Array) -> Array:
         """How the values (n,) change with the depth (n,), in their unit for each mm."""
         raise NotImplementedError
 
-    def by_strain(self, simulated: Array) -> Array | None:
+    def strain_slope(self, simulated: Array) -> Array | None:
         """How the values (n,) change with the logarithm of all strain; None where a depth decides it."""
         return None
 
@@ -131,7 +131,7 @@ class LayerMeasurement(SecondaryValues):
     kind: ClassVar = "ultrasound"
     quantity: ClassVar = "compression"
 
-    def by_depth(self, depth_mm: Array, simulated: Array) -> Array:
+    def depth_slope(self, depth_mm: Array, simulated: Array) -> Array:
         return compute_depth_slope(self.time_s, depth_mm, simulated)
 
 
@@ -146,10 +146,10 @@ class SurfaceMeasurement(SecondaryValues):
     quantity: ClassVar = "displacement"
 
     @property
-    def alike(self) -> Array:
+    def similarity(self) -> Array:
         return compute_skin_similarity(self.points, self.components)
 
-    def by_depth(self, depth_mm: Array, simulated: Array) -> Array:
+    def depth_slope(self, depth_mm: Array, simulated: Array) -> Array:
         """Moves of the skin are nearly in proportion to the depth."""
         return _divide_by_depth(depth_mm, simulated)
 
@@ -167,11 +167,11 @@ class WaveMeasurement(SecondaryValues):
     quantity: ClassVar = "speed"
     unit: ClassVar = "m/s"
 
-    def by_depth(self, depth_mm: Array, simulated: Array) -> Array:
+    def depth_slope(self, depth_mm: Array, simulated: Array) -> Array:
         """What strain adds to a speed is nearly in proportion to the depth."""
         return _divide_by_depth(depth_mm, simulated - simulated[np.argmin(depth_mm)])
 
-    def by_strain(self, simulated: Array) -> Array:
+    def strain_slope(self, simulated: Array) -> Array:
         """As much as strain adds to a speed since the first reading."""
         return np.asarray(simulated - simulated[np.argmin(self.time_s)])
 
@@ -222,7 +222,7 @@ def list_compared_tissues(facts: TraceFacts) -> list[str]:
 def _build_layer_measurement(
     tissue: str, stated: LayerRecord, curves: dict[str, Array], number: int, times_s: Array
 ) -> LayerMeasurement:
-    thinning = Thinning(
+    thinning = LayerThinning(
         tissue,
         stated.thickness_mm,
         curves["time_s"],

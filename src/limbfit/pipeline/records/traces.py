@@ -12,9 +12,9 @@ from ...results import limb as stored
 from ...study import Record, Study
 from ...traces import (
     Creep,
-    Regularised,
+    LayerThinning,
+    RegularisedCurve,
     SurfaceMotion,
-    Thinning,
     Trace,
     TraceWarning,
     WaveMeans,
@@ -41,12 +41,12 @@ SEEN = 3.0  # standard deviations that the skin must move by to be compared
 class SecondaryMeasurement(NamedTuple):
     """What was seen beside a record's force: layers, the skin, shear waves at places under the indenter."""
 
-    layers: tuple[Thinning, ...]
+    layers: tuple[LayerThinning, ...]
     motion: SurfaceMotion | None
     waves: tuple[tuple[WaveSpeeds, WaveMeans], ...]
 
 
-def read_record(study: Study, record: Record) -> tuple[Trace, Regularised, stored.TraceFacts]:
+def read_record(study: Study, record: Record) -> tuple[Trace, RegularisedCurve, stored.TraceFacts]:
     """A record as it is used, its regularised curves and the facts that ``traces.json`` holds."""
     table = study.traces
     file = study.path(record.trace)
@@ -110,7 +110,7 @@ def run_traces(context: Context, folder: Path) -> None:
 
 
 def read_observed(
-    study: Study, record: Record, trace: Trace, touch_down_s: float, smooth: Regularised
+    study: Study, record: Record, trace: Trace, touch_down_s: float, smooth: RegularisedCurve
 ) -> SecondaryMeasurement:
     """What was seen while the record's force is 5 % of its largest or more.
 
@@ -119,7 +119,7 @@ def read_observed(
     pressed = smooth.time_s[smooth.force_N >= END_SHARE * smooth.force_N.max()]
     end_s = touch_down_s + float(pressed[-1])
     time = study.traces.time_s
-    layers: tuple[Thinning, ...] = ()
+    layers: tuple[LayerThinning, ...] = ()
     waves: tuple[tuple[WaveSpeeds, WaveMeans], ...] = ()
     motion: SurfaceMotion | None = None
     if record.ultrasound is not None:

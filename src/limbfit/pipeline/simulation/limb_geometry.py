@@ -28,7 +28,7 @@ class LimbGeometry:
     places: Mapping[str, PlacedSite] = field(default_factory=dict)
 
     @classmethod
-    def stored(cls, store: Store) -> LimbGeometry:
+    def from_store(cls, store: Store) -> LimbGeometry:
         """That of the stages ``surfaces`` and ``sites``, which are done."""
         return cls(load_anatomy(store["surfaces"]), {row.site: row for row in store.results.sites.sites})
 

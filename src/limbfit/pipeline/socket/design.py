@@ -96,7 +96,7 @@ def run_socket_design(
         context.tell(NAME, done, total, words)
 
     with shape.place_errors(study, PLACE):
-        limb, target = SocketLimb.of(context, NAME), shape.build_target(study)
+        limb, target = SocketLimb.from_context(context, NAME), shape.build_target(study)
         plain, face = build_undeformed_socket(study, limb.anatomy, limb.outer.skin, optimise)
         mesh, facts = limb.mesh(folder, face, partial(context.tell, NAME, 0, 0))
         kept = ResultFiles(folder / RUNS, also=[context.store[NAME] / RUNS])
@@ -148,7 +148,7 @@ class _Design:
     fields: Mapping[str, Array] = field(default_factory=dict)
 
     @property
-    def loaded(self) -> Sequence[SocketState]:
+    def loaded_states(self) -> Sequence[SocketState]:
         """The limb under each load; after donning where there are none."""
         assert self.simulation is not None
         return self.simulation.loads or [self.simulation.donning]
@@ -157,7 +157,7 @@ class _Design:
     def peaks(self) -> dict[str, float]:
         """The largest pressure of each region over all loads, kPa."""
         peaks: dict[str, float] = {}
-        for held in self.loaded:
+        for held in self.loaded_states:
             for row in held.regions:
                 peaks[row.region] = max(row.peak_kPa, peaks.get(row.region, 0.0))
         return peaks
@@ -213,7 +213,7 @@ def _solve_designs(designs: Sequence[_Design], executor: Executor, tell: Tell, b
     for one in designs:
         facts, fields = simulate_socket(one.run)
         one = replace(one, simulation=SocketSimulation(**facts), fields=fields)
-        peak = max(held.peak_kPa for held in one.loaded)
+        peak = max(held.peak_kPa for held in one.loaded_states)
         tell(before + len(designs), f"{one.run.name}: {peak:.0f} kPa at most")
         solved.append(one)
     return solved

@@ -78,7 +78,7 @@ class SimulationSpread:
     known: ParameterSpread
 
     @classmethod
-    def of(cls, study: Study, names: Sequence[tuple[str, str]], known: ParameterSpread) -> SimulationSpread:
+    def make(cls, study: Study, names: Sequence[tuple[str, str]], known: ParameterSpread) -> SimulationSpread:
         """For a simulation whose parameters have ``names``, tissue and name, of `Problem.parameter_names`.
 
         ``known`` is of all of the study's parameters, tissue by tissue.

@@ -69,7 +69,7 @@ class SocketLimb:
     fibres: tuple[tuple[str, Direction], ...]
 
     @classmethod
-    def of(cls, context: Context, name: str) -> SocketLimb:
+    def from_context(cls, context: Context, name: str) -> SocketLimb:
         """That of a study whose surfaces are stored; ``name`` is the experiment's, for its progress."""
         study, surfaces = context.study, context.store["surfaces"]
         anatomy, thickness = load_anatomy(surfaces), study.socket.liner.thickness_mm
@@ -194,7 +194,7 @@ def solve_run(run: SocketRun, tell: Callable[[float, float, str], None]) -> Donn
     fit, kept = run.fit, run.kept
     end = fit.ends[-1][2]
 
-    def on_row(row: SocketStep) -> None:
+    def report_row(row: SocketStep) -> None:
         force = float(np.linalg.norm(row.force))
         words = f"{row.time:.2f} of {end:g} s: {force:.0f} N, {row.whole.peak_kPa:.0f} kPa at most"
         tell(row.time, end, words)
@@ -206,7 +206,7 @@ def solve_run(run: SocketRun, tell: Callable[[float, float, str], None]) -> Donn
         fit,
         run.faces,
         sensitivities=run.sensitivities,
-        on_row=on_row,
+        on_row=report_row,
         threads=run.threads,
         keep=None if kept is None else lambda part: kept.put(run.partial_key, pack(part)),
         begin=None if before is None else unpack(*before),
@@ -298,7 +298,7 @@ def summarise_run(
 ) -> dict[str, Any]:
     """What is stored of a simulation, with intervals where parameters are ``known`` so well."""
     fit, names, statistics = run.fit, found.result.parameter_names, found.result.statistics
-    spread = None if known is None else SimulationSpread.of(run.limb.study, names, known)
+    spread = None if known is None else SimulationSpread.make(run.limb.study, names, known)
     held = {name: _summarise_state(run, one, spread) for name, one in found.held.items()}
     base, loads = found.held["donning"].row, []
     for load in fit.loads:
@@ -346,7 +346,7 @@ def _summarise_strain(run: SocketRun, one: LoadedState) -> list[dict[str, Any]]:
     for number, tissue in enumerate(mesh.region_names):
         if tissue == LINER:
             continue
-        found, most_sheared = one.strains.within(mesh.regions == number)
+        found, most_sheared = one.strains.summarise_cells(mesh.regions == number)
         place = mesh.points[mesh.cells[most_sheared, :4]].mean(axis=0)
         far = np.linalg.norm(middles - place, axis=1)
         near = min(faces, key=lambda name: float(far[faces[name]].min()), default=None)

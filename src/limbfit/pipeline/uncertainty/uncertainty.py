@@ -137,7 +137,7 @@ def _predict_records(
 ) -> list[tuple[SiteRecord, SiteResponse]]:
     """Every record at the identified parameters, from what the stage ``predict`` has simulated."""
     study, records = context.study, load_records(context, context.study.recorded)
-    jobs = build_answer_jobs(records, Answer.of(calibration.stages[-1], study))
+    jobs = build_answer_jobs(records, Answer.from_stage(calibration.stages[-1], study))
     responses = [to_response(simulation) for simulation in cache.run(jobs, context.executor)]
     if records.is_coarsened:
         n = len(records.own)

@@ -19,7 +19,7 @@ from ...results.identification import SearchIteration
 from ...results.limb import PlacedSite
 from ...web import extract_interface, pack, read_shell, to_shell, to_volume_shape
 from ..formats import format_symbol, format_unit
-from ..page import Interactive
+from ..page import InteractiveFigure
 from ..store import Curves, Json, Results, name_compared
 from ..words import write_words
 from . import pictures
@@ -30,7 +30,7 @@ LAYER = "#c8a13a"
 STRESS = "von_mises_kPa"
 
 
-def make_explorer(store: Results) -> Interactive | None:
+def make_explorer(store: Results) -> InteractiveFigure | None:
     """Surfaces, layers, bones and sites, the field at the deepest point of each site, and its curves."""
     if "skin" not in store.surface_files:
         return None
@@ -48,7 +48,7 @@ def make_explorer(store: Results) -> Interactive | None:
         "curves": {site: curves for site in store.site_names if (curves := _read_site_curves(store, site))},
     }
     caption = write_words("figure explorer", radius_mm=FIELD_RADIUS_MM)
-    return Interactive("explorer", "model", "The limb in three dimensions.", caption, content)
+    return InteractiveFigure("explorer", "model", "The limb in three dimensions.", caption, content)
 
 
 def _read_surfaces(store: Results, arrays: dict[str, NDArray[Any]]) -> list[Json]:
@@ -163,7 +163,7 @@ def _read_site_curves(store: Results, site: str) -> Json | None:
     return None
 
 
-def draw_record_curves(store: Results, sites: Sequence[str]) -> Interactive | None:
+def draw_record_curves(store: Results, sites: Sequence[str]) -> InteractiveFigure | None:
     """Each record as the robot wrote it and regularised, to choose from."""
     choices = {}
     for site in sites:
@@ -183,10 +183,10 @@ def draw_record_curves(store: Results, sites: Sequence[str]) -> Interactive | No
     if not choices:
         return None
     caption = write_words("figure records")
-    return Interactive("records", "records", "Records of all sites.", caption, {"sites": choices})
+    return InteractiveFigure("records", "records", "Records of all sites.", caption, {"sites": choices})
 
 
-def draw_convergence_curves(store: Results) -> Interactive | None:
+def draw_convergence_curves(store: Results) -> InteractiveFigure | None:
     """The error and each parameter over the accepted iterates of all stages."""
     steps = [step for stage in store.stages for step in stage.iterations]
     if not steps:
@@ -201,7 +201,7 @@ def draw_convergence_curves(store: Results) -> Interactive | None:
         panels.append(panel | {"series": series})
     caption = write_words("figure iterates")
     label = "Error and parameters over the iterates."
-    return Interactive("iterates", "iterates", label, caption, {"panels": panels})
+    return InteractiveFigure("iterates", "iterates", label, caption, {"panels": panels})
 
 
 def _make_error_panel(steps: Sequence[SearchIteration]) -> Json:
