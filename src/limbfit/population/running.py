@@ -158,7 +158,7 @@ def simulate_person(job: PersonJob) -> int:
                 return job.number
 
             def tell(event: Progress, i: int = i, rule: RuleTable = rule) -> None:
-                share = min(event.done / event.total, 1.0) if event.total else 0.0
+                share = min(event.done / event.total, 1.0) if event.total and event.stage == "socket" else 0.0
                 report_progress([(i + share) / len(missing), f"{rule.name}: {event.text}"])
 
             try:
