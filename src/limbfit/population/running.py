@@ -159,7 +159,7 @@ def simulate_person(job: PersonJob) -> int:
 
             def tell(event: Progress, i: int = i, rule: RuleTable = rule) -> None:
                 share = min(event.done / event.total, 1.0) if event.total and event.stage == "socket" else 0.0
-                report_progress([(i + share) / len(missing), f"{rule.name}: {event.text}"])
+                report_progress([float((i + share) / len(missing)), f"{rule.name}: {event.text}"])
 
             try:
                 fit_socket(study, parameters=people.choose_parameters(person, study), listener=tell)
