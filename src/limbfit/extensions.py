@@ -102,17 +102,16 @@ def _run(file: Path, name: str) -> None:
         _running.pop()
 
 
-def import_extra(module: str, extra: str, what: str) -> Any:
-    """Import a library that an extra of limbfit installs.
+def import_extra(module: str, extra: str, refusal: InputError | None = None) -> Any:
+    """Import a module of a library that an extra of limbfit installs.
 
     Raises
     ------
     InputError
-        Where it is not installed; ``what`` needs it.
+        Where it is not installed: ``refusal``, where that says better what needs it.
     """
     try:
         return import_module(module)
     except ImportError:
-        library = module.partition(".")[0]
-        remedy = f"pip install 'limbfit[{extra}]'"
-        raise InputError(f"{what} needs {library}, which is not installed", remedy=remedy) from None
+        library, remedy = module.partition(".")[0], f"pip install 'limbfit[{extra}]'"
+        raise refusal or InputError(f"{library} is not installed", remedy=remedy) from None

@@ -16,6 +16,7 @@ from queue import Empty, SimpleQueue
 from typing import Any, Self
 
 from ..errors import InputError, RunError
+from ..extensions import import_extra
 from .processes import NO_LIMITS, Batch, Executor, Limits, ProcessExecutor
 
 QUEUES = {
@@ -27,7 +28,6 @@ QUEUES = {
     "htcondor": "HTCondorCluster",
 }
 LOCAL_QUEUE = "local"
-INSTALL_COMMAND = "pip install 'limbfit[dask]'"
 _SCHEDULER_GONE = "the Dask scheduler is gone; run again: finished work is kept"
 _CONNECT_S = 20.0
 _JOBS_PER_WORKER = 2  # jobs at the scheduler for every worker: one at work, one that waits
@@ -57,7 +57,7 @@ def _run_contained(
         executor = _local.executor = ProcessExecutor(1)
     executor.limits = limits
     on_lost = (lambda _, reason: _LostJob(reason)) if contained else None
-    worker = _import_dask("distributed").get_worker()
+    worker = import_extra("distributed", "dask").get_worker()
     on_report = (lambda _, message: worker.log_event(topic, (number, message))) if topic else None
     return next(executor.map(function, [job], on_lost=on_lost, on_report=on_report))
 
@@ -84,7 +84,9 @@ class DaskExecutor(Executor):
         try:
             if not address.rpartition(":")[2].isdigit():  # Dask's half-made client would end after 40 s
                 raise ValueError("no port")
-            client = _import_dask("distributed").Client(address, timeout=_CONNECT_S, set_as_default=False)
+            client = import_extra("distributed", "dask").Client(
+                address, timeout=_CONNECT_S, set_as_default=False
+            )
         except (OSError, ValueError, TypeError) as error:
             raise InputError(
                 f"no Dask scheduler answers at {address!r}",
@@ -101,13 +103,13 @@ class DaskExecutor(Executor):
         `InputError` for an unknown batch system, or one that cannot be used as configured.
         """
         if queue == LOCAL_QUEUE:
-            cluster = _import_dask("distributed").LocalCluster(
+            cluster = import_extra("distributed", "dask").LocalCluster(
                 n_workers=workers, threads_per_worker=1, dashboard_address=None, memory_limit=0
             )
         elif queue in QUEUES:
             memory = f"{limits.memory_GB or _DEFAULT_MEMORY_GB:g}GB"
             try:
-                kind = getattr(_import_dask("dask_jobqueue"), QUEUES[queue])
+                kind = getattr(import_extra("dask_jobqueue", "dask"), QUEUES[queue])
                 cluster = kind(cores=1, processes=1, memory=memory)
                 cluster.scale(jobs=workers)
             except (OSError, ValueError, TypeError, RuntimeError) as error:
@@ -122,7 +124,7 @@ class DaskExecutor(Executor):
                 place="--dask",
                 remedy=f"use {', '.join((*QUEUES, LOCAL_QUEUE))}",
             )
-        client = _import_dask("distributed").Client(cluster, set_as_default=False)
+        client = import_extra("distributed", "dask").Client(cluster, set_as_default=False)
         return cls(client, limits, cluster, workers)
 
     @property
@@ -193,7 +195,7 @@ class DaskExecutor(Executor):
         return [self._worker_of_key[key]]
 
     def _result(self, future: Any, contained: bool) -> Any:
-        distributed = _import_dask("distributed")
+        distributed = import_extra("distributed", "dask")
         try:
             return future.result()
         except distributed.KilledWorker as error:
@@ -207,11 +209,3 @@ class DaskExecutor(Executor):
         for one in (self._client, self._cluster):
             with suppress(Exception):  # nothing more is wanted of either, and there may be no cluster
                 one.close(timeout=2)
-
-
-def _import_dask(module: str) -> Any:
-    """A module of Dask's, an optional part of limbfit."""
-    try:
-        return __import__(module)
-    except ImportError as error:
-        raise InputError(f"{module} is not installed", remedy=INSTALL_COMMAND) from error

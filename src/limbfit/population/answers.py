@@ -35,7 +35,7 @@ _SOBOL = 512  # base samples of the indices
 
 
 def summarise_trial(trial: Trial, robust: RobustRule | None = None) -> PopulationResult:
-    """All answers of the people who are stored. Raises `InputError` where there are none."""
+    """All answers of the people who are stored; empty ones where there are none."""
     rows, numbers, table = _build_table(trial)
     lost = rows[rows["state"] != DONE].drop_duplicates(["person", "rule"])
     names = [rule.name for rule in trial.rules]
@@ -158,14 +158,10 @@ def _compare_rules(table: Any, names: Sequence[str], worst: dict[str, Array]) ->
 
 def fit_surrogate(inputs: Array, outputs: Array) -> Any:
     """A Gaussian process of outputs (n,) over inputs (n, d), with a length for each input and noise."""
-    learn = import_extra("sklearn.gaussian_process", "population", "the surrogate")
-    kernels = import_extra("sklearn.gaussian_process.kernels", "population", "the surrogate")
-    pipeline = import_extra("sklearn.pipeline", "population", "the surrogate")
-    scaling = import_extra("sklearn.preprocessing", "population", "the surrogate")
-    lengths = np.full(inputs.shape[1], 3.0)
-    kernel = kernels.ConstantKernel(1.0) * kernels.RBF(lengths, (0.3, 1e3)) + kernels.WhiteKernel(
-        1e-2, (1e-5, 1.0)
-    )
+    names = ("gaussian_process", "gaussian_process.kernels", "pipeline", "preprocessing")
+    learn, kernels, pipeline, scaling = (import_extra(f"sklearn.{name}", "population") for name in names)
+    smooth = kernels.RBF(np.full(inputs.shape[1], 3.0), (0.3, 1e3))
+    kernel = kernels.ConstantKernel(1.0) * smooth + kernels.WhiteKernel(1e-2, (1e-5, 1.0))
     process = learn.GaussianProcessRegressor(kernel, normalize_y=True, n_restarts_optimizer=2, random_state=0)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the length of an input that does not matter ends at its bound
@@ -177,9 +173,8 @@ def predict_left_out(inputs: Array, outputs: Array) -> Array:
     fold = np.arange(len(outputs)) % min(FOLDS, len(outputs))
     predicted = np.zeros(len(outputs))
     for one in np.unique(fold):
-        predicted[fold == one] = fit_surrogate(inputs[fold != one], outputs[fold != one]).predict(
-            inputs[fold == one]
-        )
+        fitted = fit_surrogate(inputs[fold != one], outputs[fold != one])
+        predicted[fold == one] = fitted.predict(inputs[fold == one])
     return predicted
 
 
@@ -190,8 +185,8 @@ def _find_drivers(
     count = len(next(iter(worst.values()), ()))
     if count < LEAST_PEOPLE:
         return [], [], [f"what drives the pressures is said from {LEAST_PEOPLE} people on; there are {count}"]
-    analyse = import_extra("SALib.analyze.sobol", "population", "the indices of drivers")
-    sample = import_extra("SALib.sample.sobol", "population", "the indices of drivers")
+    analyse = import_extra("SALib.analyze.sobol", "population")
+    sample = import_extra("SALib.sample.sobol", "population")
     people, notes = People(trial), list[str]()
     names = list(people.names)
     numbers = list_done(rows, trial.rules)
@@ -215,9 +210,8 @@ def _find_drivers(
                 f"{rule}: the surrogate explains {100 * max(explained, 0):.0f} % of the variance at people "
                 "left out; what it says of drivers is doubtful, and more people would help"
             )
-        found = analyse.analyze(
-            problem, fit_surrogate(inputs, outputs).predict(placed), calc_second_order=False, seed=0
-        )
+        predicted = fit_surrogate(inputs, outputs).predict(placed)
+        found = analyse.analyze(problem, predicted, calc_second_order=False, seed=0)
         drivers += [
             Driver(
                 rule=rule,

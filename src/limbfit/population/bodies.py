@@ -4,10 +4,9 @@ A limb is a file that holds all its bodies, or a folder with a file for each, na
 ``tibia.ply``).  Limbs are in correspondence where their triangles join the same points, in the same order.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -17,6 +16,7 @@ from ..arrays import Array, Indices
 from ..errors import InputError
 from ..extensions import import_extra
 
+ALL = ""  # the name of all bodies together, before they are told apart
 SMALLEST_FACES = 100  # of a body; what is smaller is left over from a segmentation
 TEMPLATE_EDGE_MM = 6.0  # of the limb that is bent onto the others
 SAME_POINT_MM = 0.01  # where corners of a file without shared points are one point
@@ -46,49 +46,52 @@ def read_bodies(paths: Sequence[Path], unit: str = "mm") -> list[LimbBodies]:
         For limbs whose bodies or triangles differ, and as `read_surface` and `name_bodies`.
     """
     first, *others = [_read_limb(path, unit) for path in paths]
-    merged, index = _merge_corners(first[0])
-    faces = (
-        index[first[1]] if isinstance(first[1], np.ndarray) else {k: index[v] for k, v in first[1].items()}
-    )
-    named = faces if isinstance(faces, dict) else name_bodies(Surface(merged, faces), paths[0])
-    limbs = [LimbBodies(merged, named)]
-    for path, (points, own) in zip(paths[1:], others, strict=True):
-        if not _is_same(own, first[1]):
+    merged, index = _merge_corners(first.points)
+    faces = {name: index[own] for name, own in first.faces.items()}
+    if ALL in faces:
+        faces = name_bodies(Surface(merged, faces[ALL]), paths[0])
+    limbs = [LimbBodies(merged, faces)]
+    for path, limb in zip(paths[1:], others, strict=True):
+        if not _is_same(limb.faces, first.faces):
             raise InputError(
                 f"its triangles are not those of {paths[0]}",
                 file=path,
                 remedy="give limbs in correspondence, or add --register",
             )
         moved = np.zeros_like(merged)
-        moved[index] = points
-        apart = np.linalg.norm(moved[index] - points, axis=1)
+        moved[index] = limb.points
+        apart = np.linalg.norm(moved[index] - limb.points, axis=1)
         if apart.max() > SAME_POINT_MM:
             raise InputError(
                 f"points that {paths[0]} joins are {apart.max():.2g} mm apart",
                 file=path,
                 remedy="give limbs in correspondence, or add --register",
             )
-        limbs.append(LimbBodies(moved, named))
+        limbs.append(LimbBodies(moved, faces))
     return limbs
 
 
-def _read_limb(path: Path, unit: str) -> tuple[Array, Indices | dict[str, Indices]]:
-    """Points as the files hold them, with faces; of a folder by the names of its files."""
+def _read_limb(path: Path, unit: str) -> LimbBodies:
+    """Points as the files hold them; the bodies of a folder by the names of its files, else `ALL` as one."""
     if not path.is_dir():
-        surface = read_surface(path, unit=unit, merge=False)
-        return surface.points, surface.faces
+        return _stack_bodies({ALL: read_surface(path, unit=unit, merge=False)})
     files = sorted(file for file in path.iterdir() if file.suffix.lower() in SUFFIXES)
     if not files:
         raise InputError("no surfaces are there", file=path, remedy="give files such as skin.stl, tibia.stl")
-    points, faces, start = [], {}, 0
-    for file in files:
-        surface = read_surface(file, unit=unit, merge=False)
-        points.append(surface.points)
-        faces[file.stem.removeprefix("bone-")] = surface.faces + start
-        start += len(surface.points)
-    if "skin" not in faces:
+    names = [file.stem.removeprefix("bone-") for file in files]
+    if "skin" not in names:
         raise InputError("no file is named skin", file=path, remedy="name each file for its body")
-    return np.vstack(points), faces
+    read = [read_surface(file, unit=unit, merge=False) for file in files]
+    return _stack_bodies(dict(zip(names, read, strict=True)))
+
+
+def _stack_bodies(bodies: Mapping[str, Surface]) -> LimbBodies:
+    points, faces, start = [], {}, 0
+    for name, body in bodies.items():
+        points.append(body.points)
+        faces[name] = body.faces + start
+        start += len(body.points)
+    return LimbBodies(np.vstack(points), faces)
 
 
 def _merge_corners(points: Array) -> tuple[Array, Indices]:
@@ -97,10 +100,8 @@ def _merge_corners(points: Array) -> tuple[Array, Indices]:
     return points[where], index.ravel()
 
 
-def _is_same(faces: Any, others: Any) -> bool:
-    if isinstance(faces, dict) and isinstance(others, dict):
-        return faces.keys() == others.keys() and all(np.array_equal(faces[k], others[k]) for k in faces)
-    return not isinstance(faces, dict) and not isinstance(others, dict) and np.array_equal(faces, others)
+def _is_same(faces: Mapping[str, Indices], others: Mapping[str, Indices]) -> bool:
+    return faces.keys() == others.keys() and all(np.array_equal(faces[k], others[k]) for k in faces)
 
 
 def name_bodies(surface: Surface, file: Path) -> dict[str, Indices]:
@@ -155,10 +156,11 @@ def register_limbs(paths: Sequence[Path], unit: str = "mm") -> tuple[list[LimbBo
     InputError
         For limbs with other bodies than the first, and as `read_bodies`.
     """
-    registration = import_extra("trimesh.registration", "population", "registering limbs")
-    mesh = import_extra("trimesh", "population", "registering limbs").Trimesh
+    registration = import_extra("trimesh.registration", "population")
+    mesh = import_extra("trimesh", "population").Trimesh
     limbs = [read_bodies([path], unit)[0] for path in paths]
-    template = _make_template(limbs[0])
+    even = {name: remesh(limbs[0].extract(name), TEMPLATE_EDGE_MM) for name in limbs[0].faces}
+    template = _stack_bodies(even)
     found, told = [], []
     for path, limb in zip(paths, limbs, strict=True):
         odd = sorted(limb.faces.keys() ^ template.faces.keys())
@@ -187,13 +189,3 @@ def _fill_box(points: Array, target: Array) -> Array:
     """Points (n, 3) stretched along the axes so that they fill the box of the target's: where to begin."""
     low, size = target.min(axis=0), np.ptp(target, axis=0)
     return low + (points - points.min(axis=0)) / np.ptp(points, axis=0) * size
-
-
-def _make_template(limb: LimbBodies) -> LimbBodies:
-    points, faces, start = [], {}, 0
-    for name in limb.faces:
-        even = remesh(limb.extract(name), TEMPLATE_EDGE_MM)
-        points.append(even.points)
-        faces[name] = even.faces + start
-        start += len(even.points)
-    return LimbBodies(np.vstack(points), faces)

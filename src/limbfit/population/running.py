@@ -44,8 +44,8 @@ _REGION = ("mean_kPa", "peak_kPa", "shear_kPa", "shear_peak_kPa")
 
 def import_pandas() -> Any:
     """Pandas with its Parquet engine. Raises `InputError` where one is not installed."""
-    import_extra("pyarrow", "population", "the store of a trial")
-    return import_extra("pandas", "population", "the store of a trial")
+    import_extra("pyarrow", "population")
+    return import_extra("pandas", "population")
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ class TrialStore:
         if trial.tissues.study is not None:
             files.append(trial.tissues.study / "results" / "calibrate" / "calibration.json")
         known = [compute_file_digest(trial.path(file)) for file in files if trial.path(file).exists()]
-        return compute_digest(tables, trial.population.seed, known, code_digest(fit_socket))
+        return compute_digest(tables, trial.population.seed, known, code_digest(simulate_person))
 
     def file(self, number: int, rule: RuleTable) -> Path:
         """Where the rows of a person with a rule are."""
@@ -82,7 +82,7 @@ class TrialStore:
         files = [file for number, end, file in found if end in known and (rules or number < FIRST_APART)]
         if not files:
             return pandas.DataFrame({name: [] for name in COLUMNS})
-        return pandas.concat([pandas.read_parquet(file) for file in files], ignore_index=True)
+        return pandas.read_parquet(files)
 
     def write(self, number: int, rule: RuleTable, state: str, text: str, rows: list[tuple[Any, ...]]) -> None:
         """Store the ``rows`` (load, place, quantity, value) of a person with a rule."""
@@ -94,17 +94,16 @@ class TrialStore:
         with write_atomically(self.file(number, rule)) as stream:
             frame.to_parquet(stream, index=False)
 
-    def drop_stale(self, rules: Sequence[RuleTable]) -> int:
-        """Delete rows of people that no rule's digest knows any more; how many files there were.
+    def drop_stale(self) -> None:
+        """Delete rows of people that no rule's digest knows any more.
 
         People of the search for a robust rule, whose numbers are apart, are kept.
         """
-        known = [_split_name(self.file(0, rule))[1] for rule in rules]
-        found = [(file, *_split_name(file)) for file in self.folder.glob("*.parquet")]
-        stale = [file for file, number, end in found if number < FIRST_APART and end not in known]
-        for file in stale:
-            file.unlink()
-        return len(stale)
+        known = [_split_name(self.file(0, rule))[1] for rule in self.trial.rules]
+        for file in self.folder.glob("*.parquet"):
+            number, end = _split_name(file)
+            if number < FIRST_APART and end not in known:
+                file.unlink()
 
 
 def _split_name(file: Path) -> tuple[int, str]:
@@ -143,19 +142,19 @@ def simulate_person(job: PersonJob) -> int:
             return job.number
         start = perf_counter()
         limb = people.build_limb(person, folder)
+        studies = [people.write_study(person, rule, limb, folder / rule.name) for rule in missing]
+        report_progress([0.0, "the limb's surfaces"])
+        try:  # the limb is the same with every socket
+            run_study(studies[0], until="surfaces")
+            people.check_limb(load_anatomy(studies[0].results / "surfaces"))
+        except InputError as error:
+            for rule in job.rules:
+                store.write(job.number, rule, REJECTED, str(error), [])
+            shutil.rmtree(folder, ignore_errors=True)
+            return job.number
         shared = (perf_counter() - start) / len(missing)
-        for i, rule in enumerate(missing):
+        for i, (rule, study) in enumerate(zip(missing, studies, strict=True)):
             start = perf_counter()
-            report_progress([i / len(missing), f"{rule.name}: the limb's surfaces"])
-            study = people.write_study(person, rule, limb, folder / rule.name)
-            try:
-                run_study(study, until="surfaces")
-                people.check_limb(load_anatomy(study.results / "surfaces"))
-            except InputError as error:
-                for one in job.rules:
-                    store.write(job.number, one, REJECTED, str(error), [])
-                shutil.rmtree(folder, ignore_errors=True)
-                return job.number
 
             def tell(event: Progress, i: int = i, rule: RuleTable = rule) -> None:
                 share = min(event.done / event.total, 1.0) if event.total and event.stage == "socket" else 0.0

@@ -112,7 +112,7 @@ def build_shape_model(
         left_out, specificity = measure_left_out(aligned), measure_specificity(aligned, middle, modes)
     else:
         aligned, middle = np.stack([move_onto(one, points[0]) for one in points[1:]]), points[0]
-        modes = find_modes(*weigh_sides((aligned - middle) / at))
+        modes = find_modes(weigh_sides((aligned - middle) / at), 1.0)
         left_out, specificity = None, None
     variance = (modes**2).sum(axis=(1, 2))
     figures = ShapeModelResult(
@@ -157,12 +157,12 @@ def find_modes(deviations: Array, degrees: float) -> Array:
     return scaled.reshape(-1, *deviations.shape[1:])
 
 
-def weigh_sides(deviations: Array) -> tuple[Array, float]:
+def weigh_sides(deviations: Array) -> Array:
     """Deviations (N, n, 3) by one standard deviation, where a mode may be there to both sides: each half."""
     flat = deviations.reshape(len(deviations), -1)
     cosines = flat @ flat.T / np.outer(*[np.linalg.norm(flat, axis=1)] * 2)
     weights = np.where((cosines < -0.5).any(axis=1), 0.5, 1.0)
-    return deviations * np.sqrt(weights)[:, None, None], 1.0
+    return deviations * np.sqrt(weights)[:, None, None]
 
 
 def measure_left_out(limbs: Array) -> list[float]:

@@ -54,10 +54,10 @@ def write_trial(
     if file.exists():
         raise InputError("there is a trial already", file=file, remedy="give another folder, or edit it")
     shapes = PHANTOM_SHAPES
-    for key, given in (("model", model), ("folder", limbs)):
+    for option, key, given in (("--model", "model", model), ("--limbs", "folder", limbs)):
         if given is not None:
             if not Path(given).exists():
-                raise InputError("does not exist", file=given, place=f"--{key}")
+                raise InputError("does not exist", file=given, place=option)
             shapes = f'{key} = "{Path(given).absolute().as_posix()}"'
     folder.mkdir(parents=True, exist_ok=True)
     text = _TEMPLATE.read_text(encoding="utf-8").replace(PHANTOM_SHAPES, shapes)
@@ -137,7 +137,7 @@ def run_population(
         raise InputError(
             "the trial states no limit", file=trial.file, place="limits", remedy="state [[limits]]"
         )
-    TrialStore(trial).drop_stale(trial.rules)
+    TrialStore(trial).drop_stale()
     if within_percent is None:
         run_people(trial, wanted, listener=listener)
     else:
@@ -231,6 +231,6 @@ def make_robust(
         Where the trial states no ``[robust]``, or its keys are not those of the first rule.
     """
     trial = load_trial(path)
-    run_people(trial, 2, listener=listener)
+    run_people(trial, 2, listener=listener)  # the answers of the trial itself stand beside the rule
     robust = find_robust_rule(trial, people, fresh, listener)
     return _store(trial, summarise_trial(trial, robust))

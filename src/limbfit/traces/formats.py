@@ -8,7 +8,6 @@ Sources: National Instruments, Specification for the LabVIEW Measurement File (.
 import csv
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +15,7 @@ import numpy as np
 from scipy.io import loadmat, whosmat
 
 from ..errors import TraceError
+from ..extensions import import_extra
 
 BINARY_SUFFIXES = (".mat", ".tdms", ".xlsx", ".xlsm", ".xls")  # of files that are no text
 MAX_PREAMBLE = 1000  # lines before the header
@@ -247,13 +247,9 @@ def _add_times(
 
 
 def _import(module: str, package: str, extra: str, suffix: str) -> Any:
-    try:
-        return import_module(module)
-    except ImportError:
-        raise TraceError(
-            f"files {suffix} are read by {package}, which is not installed",
-            remedy=f"pip install 'limbfit[{extra}]', or export the record as CSV",
-        ) from None
+    what = f"files {suffix} are read by {package}, which is not installed"
+    remedy = f"pip install 'limbfit[{extra}]', or export the record as CSV"
+    return import_extra(module, extra, TraceError(what, remedy=remedy))
 
 
 def _read_tdms(file: Path, columns: Names) -> ColumnTable:
