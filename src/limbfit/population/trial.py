@@ -1,15 +1,14 @@
 """``population.toml``: whose limbs, which tissues, weights, liners and sockets, how many people."""
 
-import json
-import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, ValidationError
+from pydantic import Field
 
 from ..errors import StudyError, add_location
+from ..study.loading import check_content, read_toml
 from ..study.socket import NAME
-from ..study.tables import ExecutionTable, Positive, TomlTable, find_repeated
+from ..study.tables import ExecutionTable, Positive, TomlFile, TomlTable, find_repeated
 
 FILE = "population.toml"
 Factor = Annotated[float, Field(ge=1, le=5)]
@@ -104,10 +103,9 @@ class RobustTable(TomlTable):
             raise ValueError("ranges: give two numbers for each key, the smaller one first")
 
 
-class Trial(TomlTable):
+class Trial(TomlFile):
     """A checked ``population.toml``."""
 
-    file: Path
     population: PopulationTable = PopulationTable()
     shapes: ShapesTable
     tissues: TissuesTable = TissuesTable()
@@ -135,20 +133,6 @@ class Trial(TomlTable):
         if own := sorted({"study", "surfaces", "image", "sites", "execution"}.intersection(self.person)):
             raise ValueError(f"person: the table {own[0]} is written for each person; leave it out")
 
-    @property
-    def folder(self) -> Path:
-        """Where the trial lies."""
-        return self.file.parent
-
-    @property
-    def results(self) -> Path:
-        """Where its results lie."""
-        return self.folder / "results"
-
-    def path(self, path: Path) -> Path:
-        """A path that the file names, from where the file is."""
-        return self.folder / path
-
     def build_liner_table(self, thickness_mm: float) -> dict[str, Any]:
         """The table ``[socket.liner]`` of a person; one without thickness has no material."""
         table: dict[str, Any] = {"thickness_mm": thickness_mm}
@@ -167,24 +151,9 @@ def load_trial(path: str | Path) -> Trial:
     file = file / FILE if file.is_dir() else file
     if not file.is_file():
         raise StudyError("no such trial", file=file, remedy="limbfit population init makes one")
-    try:
-        content = tomllib.loads(file.read_text(encoding="utf-8-sig"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise StudyError(f"not valid TOML: {error}", file=file) from None
+    content = read_toml(file)
     with add_location(file=file):
-        if "file" in content:
-            raise StudyError("unknown key", place="file", remedy="see docs/population.md for the keys")
-        try:
-            text = json.dumps(content | {"file": str(file.absolute())}, default=str)
-            trial = Trial.model_validate_json(text, strict=True)
-        except ValidationError as error:
-            first = error.errors()[0]
-            unknown = first["type"] == "extra_forbidden"
-            raise StudyError(
-                "unknown key" if unknown else first["msg"].removeprefix("Value error, "),
-                place=".".join(map(str, first["loc"])) or None,
-                remedy="see docs/population.md for the keys",
-            ) from None
+        trial = check_content(Trial, content, "docs/population.md", file=str(file.absolute()))
         for key, named in (("model", trial.shapes.model), ("folder", trial.shapes.folder)):
             if named is not None and not trial.path(named).exists():
                 raise StudyError(f"{named} does not exist", place=f"shapes.{key}")

@@ -5,7 +5,7 @@ import tomllib
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from pydantic import ValidationError
 
@@ -17,6 +17,9 @@ from ..shapes import SHAPES
 from .meshing import ACCURACIES, EdgesTable
 from .records import RecordTable, Site
 from .study import Study
+from .tables import TomlTable
+
+Table = TypeVar("Table", bound=TomlTable)
 
 
 def load_study(path: str | Path, *, recorded: bool = True) -> Study:
@@ -30,21 +33,11 @@ def load_study(path: str | Path, *, recorded: bool = True) -> Study:
         file = file / "study.toml"
     if not file.is_file():
         raise StudyError("no such study", file=file, remedy="give a study.toml or the folder that holds one")
-    try:  # "-sig": editors on Windows may begin a file with a mark
-        content = tomllib.loads(file.read_text(encoding="utf-8-sig"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise StudyError(f"not valid TOML: {error}", file=file) from None
+    content = read_toml(file)
     notes = _place_by_markups(content, file)
     _load_extensions(content, file)
     with add_location(file=file):
-        for key in ("file", "notes"):  # of a study, but none of its file
-            if key in content:
-                raise StudyError("unknown key", place=key, remedy="see docs/study.md for the keys")
-        try:  # as JSON, of which neither "12" nor true is a number
-            text = json.dumps(content | {"file": str(file), "notes": notes}, default=str)
-            study = Study.model_validate_json(text, strict=True)
-        except ValidationError as error:
-            raise _build_study_error(error, content) from None
+        study = check_content(Study, content, "docs/study.md", file=str(file), notes=notes)
         for place, path in study.inputs.items():
             at = study.path(path)
             if (recorded or not place.startswith(("sites.", "records."))) and not at.exists():
@@ -57,6 +50,28 @@ def load_study(path: str | Path, *, recorded: bool = True) -> Study:
     what = "no record names it; only limbfit design --protocol does"
     notes = (*notes, *(f"indenters.{name}: {what}" for name in unused))
     return study.model_copy(update={"notes": notes})
+
+
+def read_toml(file: Path) -> dict[str, Any]:
+    """Read a TOML file. Raises `StudyError` for one that is not valid."""
+    try:  # "-sig": editors on Windows may begin a file with a mark
+        return tomllib.loads(file.read_text(encoding="utf-8-sig"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise StudyError(f"not valid TOML: {error}", file=file) from None
+
+
+def check_content(model: type[Table], content: dict[str, Any], page: str, **own: Any) -> Table:
+    """The checked table of a file's content and of keys of its ``own``, which no file may have.
+
+    Raises `StudyError` with the key, and the ``page`` of the documentation that lists the keys.
+    """
+    for key in own:
+        if key in content:
+            raise StudyError("unknown key", place=key, remedy=f"see {page} for the keys")
+    try:  # as JSON, of which neither "12" nor true is a number
+        return model.model_validate_json(json.dumps(content | own, default=str), strict=True)
+    except ValidationError as error:
+        raise _build_study_error(error, content, page) from None
 
 
 def _place_by_markups(content: dict[str, Any], file: Path) -> tuple[str, ...]:
@@ -96,14 +111,14 @@ def _load_extensions(content: dict[str, Any], file: Path) -> None:
         load_extensions(file.parent / name for name in named)
 
 
-def _build_study_error(error: ValidationError, content: dict[str, Any]) -> StudyError:
+def _build_study_error(error: ValidationError, content: dict[str, Any], page: str) -> StudyError:
     found = error.errors()
     first = next((one for one in found if one["type"] == "value_error"), found[0])  # it says most
     more = len(found) - 1
     place, kind, given = _name_place(first["loc"], content), first["type"], first["input"]
     what, remedy = first["msg"].removeprefix("Value error, "), None
     if kind == "extra_forbidden":
-        what, remedy = "unknown key", "see docs/study.md for the keys"
+        what, remedy = "unknown key", f"see {page} for the keys"
     elif kind == "string_pattern_mismatch":
         what, remedy = f"{given!r} is no name", "begin with a letter; then A to Z, digits or _, up to 30"
     elif kind == "tuple_type" and isinstance(given, dict):

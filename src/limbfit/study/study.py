@@ -27,7 +27,7 @@ def _replace_lists(content: Any) -> Any:
     return tuple(map(_replace_lists, content)) if isinstance(content, list) else content
 
 
-class Study(tables.TomlTable):
+class Study(tables.TomlFile):
     """A checked study; ``folder`` is where it lives, ``notes`` what its user should know."""
 
     study: tables.StudyTable
@@ -59,14 +59,6 @@ class Study(tables.TomlTable):
     def _fill_mesh_edges(cls, content: dict[str, Any]) -> dict[str, Any]:
         edges = replace_edges(content.get("mesh", {}), list_indenter_widths(content))
         return {**_replace_lists(content), "mesh": edges}
-
-    @property
-    def folder(self) -> Path:
-        return self.file.parent
-
-    @property
-    def results(self) -> Path:
-        return self.folder / "results"
 
     @property
     def fitted(self) -> tuple[Site, ...]:
@@ -208,10 +200,6 @@ class Study(tables.TomlTable):
         if self.markups is not None:
             named["markups.file"] = self.markups.file
         return {key: path for key, path in named.items() if path is not None}
-
-    def path(self, relative: Path) -> Path:
-        """A path of the study file as a path of this machine."""
-        return self.folder / relative
 
     def is_recorded(self, indentation: Indentation) -> bool:
         """True if the record of an indentation has been made."""

@@ -64,6 +64,26 @@ class TomlTable(BaseModel):
         """Raise `ValueError` where keys, each of the right type, contradict one another."""
 
 
+class TomlFile(TomlTable):
+    """The table of a whole ``file``: relative paths in it are from its folder, where its results lie too."""
+
+    file: Path = Field(exclude=True)
+
+    @property
+    def folder(self) -> Path:
+        """Where the file lies."""
+        return self.file.parent
+
+    @property
+    def results(self) -> Path:
+        """Where its results lie."""
+        return self.folder / "results"
+
+    def path(self, relative: Path) -> Path:
+        """A path of the file as a path of this machine."""
+        return self.folder / relative
+
+
 def find_repeated(names: Iterable[str]) -> list[str]:
     """Return the names that are there more than once, in their order."""
     return [name for name, count in Counter(names).items() if count > 1]
