@@ -128,6 +128,7 @@ NOT_VERBS = {
     "by_tissue": "users call it of Study",
     "coupling": "a noun of mechanics",
     "_coupling": "a noun of mechanics",
+    "grown": "users call it of SmoothSurface",
     "in_solver_units": "users call it of TissueLaw",
     "meshing": "a command",
     "of": "a constructor: users call that of Motion, Shape and SmoothSurface",

@@ -61,7 +61,7 @@ def test_a_smooth_distance_is_that_of_the_facets():
 @pytest.mark.parametrize("growth", [1.0, 0.4])
 def test_derivatives_of_a_smooth_distance_are_differences(growth):
     """Behind the wall, and where it fades past the brim at a height of 60 mm."""
-    surface, h = ROUND.grow(growth), 1e-5
+    surface, h = ROUND.grown(growth), 1e-5
     x = on_cup(33.0 + 4.0 * (1.0 - growth), 300)
     x[:200, 2] += 6.0
     values, slopes, bends = surface.local_distance(x)
@@ -90,9 +90,9 @@ def test_a_surface_grows_from_its_clear_shape_to_the_final_one():
     x = on_cup(31.0, 60)
     angle = np.arctan2(x[:, 1], x[:, 0])
     clear = SmoothSurface.of(CUP[0] * [1.15, 1.1, 1.0] - [0.0, 0.0, 3.0], CUP[1], spacing=1.5)
-    np.testing.assert_allclose(ROUND.grow(0.0).signed_distance(x), clear.signed_distance(x), atol=0.05)
-    half, slopes, _ = ROUND.grow(0.5).local_distance(x)
-    ends = [ROUND.grow(share).signed_distance(x) for share in (0.0, 1.0)]
+    np.testing.assert_allclose(ROUND.grown(0.0).signed_distance(x), clear.signed_distance(x), atol=0.05)
+    half, slopes, _ = ROUND.grown(0.5).local_distance(x)
+    ends = [ROUND.grown(share).signed_distance(x) for share in (0.0, 1.0)]
     np.testing.assert_allclose(half, np.mean(ends, axis=0), atol=1e-12)
     assert (ends[0] > 0.0).all()
     assert (ends[1] < 0.0).all()

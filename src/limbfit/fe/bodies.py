@@ -84,7 +84,7 @@ class _Body:
         if len(self.free):
             found = u[self.row : self.row + 2].ravel() / self.scale
             coordinates[self.free] = found[self.free]
-        pose = Pose(self.start.grow(growth), self.pivot, coordinates)
+        pose = Pose(self.start.grown(growth), self.pivot, coordinates)
         return Tool(self.surface, pose, u, self.free, self.row, self.unit)
 
 

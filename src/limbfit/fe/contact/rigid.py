@@ -109,7 +109,7 @@ class RigidShape(ABC):
         """True if it has other forms than its final one."""
         return False
 
-    def grow(self, share: float) -> Self:
+    def grown(self, share: float) -> Self:
         """The shape when it has grown so far; 1 is its final form."""
         return self
 

@@ -108,7 +108,7 @@ class SmoothSurface(Wall):
     def grows(self) -> bool:
         return self.clear is not None
 
-    def grow(self, share: float) -> Self:
+    def grown(self, share: float) -> Self:
         other = copy(self)
         other.__dict__["growth"] = share
         return other

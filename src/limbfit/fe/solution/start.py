@@ -38,7 +38,7 @@ def measure_indenter_travel(system: System, modulus: float) -> float:
     bodies = system.problem.rigid_bodies
     if not bodies:
         return float(np.abs(system.problem.history.driver).max())
-    grown = [-one.surface.gaps_at_rest(one.start.grow(1.0)).min() for one in system.bodies.all
+    grown = [-one.surface.gaps_at_rest(one.start.grown(1.0)).min() for one in system.bodies.all
              if one.stated.motion.grows]  # fmt: skip
     if max(grown, default=0.0) > 0.0:
         return float(max(grown))
