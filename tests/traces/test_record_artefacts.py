@@ -242,6 +242,15 @@ def test_a_record_of_few_different_times_is_refused(sound):
         check_trace(replace(trace, time_s=np.round(trace.time_s)))
 
 
+def test_a_way_in_within_one_time_is_refused(sound):
+    trace, _ = sound
+    moving = np.abs(np.gradient(trace.displacement_mm)) > 1e-6
+    inwards = moving & (np.arange(len(moving)) <= trace.displacement_mm.argmax())
+    time = np.where(inwards, trace.time_s[inwards].min(), trace.time_s)
+    with pytest.raises(TraceError, match=r"time_s: the indenter moves in by .* mm within one time"):
+        check_trace(replace(trace, time_s=np.maximum.accumulate(time)))
+
+
 # --- sound records
 
 

@@ -5,6 +5,7 @@ the columns of `COLUMNS`. A file is there whole or not at all, and its name hold
 it: a run that was killed goes on with what is missing, and a changed rule is simulated anew.
 """
 
+import os
 import shutil
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -26,7 +27,7 @@ from ..extensions import import_extra
 from ..pipeline.commands.planning import fit_socket
 from ..pipeline.commands.run import ensure_compiled, run_study
 from ..pipeline.engine.context import Listener, Progress, ignore_progress
-from ..pipeline.engine.digests import code_digest, compute_digest, compute_file_digest
+from ..pipeline.engine.digests import code_digest, compute_digest, compute_input_digest
 from ..pipeline.engine.store import lock, write_atomically
 from ..results.socket import SocketLoad, SocketResult
 from .people import People
@@ -66,7 +67,7 @@ class TrialStore:
         files = [shapes.model] if shapes.model else [shapes.folder] if shapes.folder else []
         if trial.tissues.study is not None:
             files.append(trial.tissues.study / "results" / "calibrate" / "calibration.json")
-        known = [compute_file_digest(trial.path(file)) for file in files if trial.path(file).exists()]
+        known = [compute_input_digest(trial.path(file)) for file in files if trial.path(file).exists()]
         return compute_digest(tables, trial.population.seed, known, code_digest(simulate_person))
 
     def file(self, number: int, rule: RuleTable) -> Path:
@@ -149,7 +150,7 @@ def simulate_person(job: PersonJob) -> int:
             people.check_limb(load_anatomy(studies[0].results / "surfaces"))
         except InputError as error:
             for rule in job.rules:
-                store.write(job.number, rule, REJECTED, str(error), [])
+                store.write(job.number, rule, REJECTED, _describe_loss(error, folder), [])
             shutil.rmtree(folder, ignore_errors=True)
             return job.number
         shared = (perf_counter() - start) / len(missing)
@@ -163,7 +164,7 @@ def simulate_person(job: PersonJob) -> int:
             try:
                 fit_socket(study, parameters=people.choose_parameters(person, study), listener=tell)
             except LimbfitError as error:
-                store.write(job.number, rule, FAILED, str(error), [])
+                store.write(job.number, rule, FAILED, _describe_loss(error, folder), [])
                 continue
             found = SocketResult.read(study.results)
             if limb.skin_points is not None:
@@ -172,6 +173,11 @@ def simulate_person(job: PersonJob) -> int:
             rows = [("", INPUT, name, value) for name, value in person.inputs.items()]
             store.write(job.number, rule, DONE, "", [*rows, *_list_rows(found), ("", "", "seconds", seconds)])
     return job.number
+
+
+def _describe_loss(error: LimbfitError, folder: Path) -> str:
+    """Why a person is missing; files are named from the person's folder, for tables are passed on."""
+    return str(error).replace(f"{folder}{os.sep}", "")
 
 
 def _list_rows(found: SocketResult) -> Iterator[tuple[str, str, str, float]]:

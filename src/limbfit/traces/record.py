@@ -159,7 +159,10 @@ def _compute_typical_speed(time: Array, u: Array) -> float:
     if not len(below):
         what = f"the displacement starts at {u[0]:.3g} mm and falls to {low:.3g} mm at once"
         raise TraceError(what, remedy="cut off the samples before the indenter moves in")
-    return float((u[top] - u[below[-1]]) / (time[top] - time[below[-1]]))
+    if not (duration := time[top] - time[below[-1]]):
+        what = f"the indenter moves in by {u[top] - u[below[-1]]:.3g} mm within one time, {time[top]:g} s"
+        raise TraceError(what, place=COLUMNS[0], remedy="export times with more digits")
+    return float((u[top] - u[below[-1]]) / duration)
 
 
 def _check_range(

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from limbfit.errors import RunError
-from limbfit.pipeline.engine.digests import compute_file_digest
+from limbfit.pipeline.engine.digests import compute_input_digest
 from limbfit.pipeline.engine.store import (
     EARLIER,
     ResultFiles,
@@ -172,11 +172,11 @@ def test_failed_rewrite_leaves_the_old_file(tmp_path):
 def test_file_digest_sees_names_and_contents(tmp_path):
     (tmp_path / "d").mkdir()
     (tmp_path / "d" / "1").write_text("x")
-    before = compute_file_digest(tmp_path / "d")
+    before = compute_input_digest(tmp_path / "d")
     (tmp_path / "d" / "1").rename(tmp_path / "d" / "2")
-    renamed = compute_file_digest(tmp_path / "d")
+    renamed = compute_input_digest(tmp_path / "d")
     (tmp_path / "d" / "2").write_text("y")
-    assert len({before, renamed, compute_file_digest(tmp_path / "d")}) == 3
+    assert len({before, renamed, compute_input_digest(tmp_path / "d")}) == 3
 
 
 def test_second_run_is_refused_while_the_first_lives(tmp_path):

@@ -38,15 +38,21 @@ def find_data_files(path: Path) -> list[Path]:
     return [file for name in names if name and (file := path.parent / name).is_file()]
 
 
-def compute_file_digest(path: Path) -> str:
-    """SHA-256 of a file, with that of its voxels apart, or of names and contents of all below a folder."""
+def compute_file_digest(file: Path) -> str:
+    """SHA-256 of what one file holds."""
+    with file.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def compute_input_digest(path: Path) -> str:
+    """SHA-256 of an input: a file, a header with its voxels, or names and contents below a folder."""
+    files = list_files(path) if path.is_dir() else [path, *find_data_files(path)]
+    if files == [path]:
+        return compute_file_digest(path)
     sha = hashlib.sha256()
-    for file in list_files(path) if path.is_dir() else [path, *find_data_files(path)]:
-        if path.is_dir():
-            sha.update(file.relative_to(path).as_posix().encode())
-        with file.open("rb") as stream:
-            while block := stream.read(1 << 20):
-                sha.update(block)
+    for file in files:
+        sha.update(file.relative_to(path).as_posix().encode() if path.is_dir() else b"")
+        sha.update(file.read_bytes())
     return sha.hexdigest()
 
 

@@ -20,7 +20,7 @@ from ...extensions import compute_extensions_digest
 from ...fe import StepControl
 from ...results.runs import StageParts
 from ...study import Study
-from .digests import code_parts, compute_digest, compute_file_digest
+from .digests import code_parts, compute_digest, compute_input_digest
 from .store import find_hand_labels
 
 LIBRARIES = (
@@ -89,7 +89,7 @@ def list_input_files(study: Study) -> dict[str, list[Path]]:
 
 def compute_input_digests(study: Study) -> dict[str, str]:
     """SHA-256 of every input by its key in the study file; names of files and folders may be a patient's."""
-    return {key: compute_file_digest(study.path(path)) for key, path in study.inputs.items()}
+    return {key: compute_input_digest(study.path(path)) for key, path in study.inputs.items()}
 
 
 def record_settings(study: Study, digests: Mapping[str, str]) -> dict[str, Any]:
@@ -163,7 +163,7 @@ class Keys:
         named = {path for paths in list_input_files(study).values() for path in paths}
         places = {path: study.path(path) for path in named}
         # A record that is yet to be made has none.
-        self._files = {path: compute_file_digest(at) if at.exists() else "" for path, at in places.items()}
+        self._files = {path: compute_input_digest(at) if at.exists() else "" for path, at in places.items()}
         own = compute_extensions_digest(study.extensions)  # they may change what any stage does
         self._code = {"limbfit": __version__} | ({"study.extensions": own} if own else {})
 

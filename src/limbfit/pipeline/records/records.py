@@ -202,6 +202,7 @@ def load_site_record(context: Context, record: Record) -> SiteRecord:
     waves.
     """
     study, folder = context.study, context.store["traces"]
+    surface_error_mm = estimate_surface_error_mm(study, context.store)
     facts, points = context.results.traces.sites[record.name], None
     force = (facts.knots_N or ()) if record.forced else ()
     tissues = list_compared_tissues(facts)
@@ -226,7 +227,7 @@ def load_site_record(context: Context, record: Record) -> SiteRecord:
         secondary=read_secondary_values(folder, record, facts, points, curves["time_s"]),
         touch_down_sd_mm=facts.touch_down_uncertainty_mm,
         error_share=study.calibration.force_error_percent / 100.0,
-        surface_error_mm=estimate_surface_error_mm(study, context.store),
+        surface_error_mm=surface_error_mm,
     )
 
 
