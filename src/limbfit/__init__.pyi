@@ -5,7 +5,11 @@ from .anatomy.images.dicom import describe_series as describe_series
 from .anatomy.images.formats import register_image_format as register_image_format
 from .bench.meshing import bench_meshing as bench_meshing
 from .bench.parity import bench_febio_parity as bench_febio_parity
-from .bench.timing import bench_forward as bench_forward, bench_scaling as bench_scaling
+from .bench.timing import (
+    bench_forward as bench_forward,
+    bench_scaling as bench_scaling,
+    bench_socket as bench_socket,
+)
 from .errors import (
     InputError as InputError,
     LimbfitError as LimbfitError,

@@ -15,6 +15,7 @@ from limbfit.bench.parity import ALL_CASES, CUBES, SOCKET, bench_febio_parity, f
 from limbfit.bench.timing import (
     bench_forward,
     bench_scaling,
+    bench_socket,
     build_layered_block,
     build_punched_block,
     choose_divisions,
@@ -126,6 +127,17 @@ def test_the_ratio_is_that_of_two_times_measured_in_one_run(febio, monkeypatch):
     monkeypatch.setenv("FEBIO_CMD", "no-such-program")
     with pytest.raises(InputError, match="no-such-program"):
         bench_forward(REFERENCE, "block/block_hex8", beside_febio=True, tell=silent)
+
+
+@pytest.mark.febio
+@with_reference
+def test_a_socket_is_timed_beside_febio(febio, monkeypatch):
+    monkeypatch.setenv("FEBIO_CMD", str(febio))
+    found = bench_socket(REFERENCE, "tube", beside_febio=True, tell=silent)
+    assert found["completed"]
+    assert found["ratio"] == pytest.approx(found["febio_seconds"] / found["seconds"])
+    with pytest.raises(InputError, match="unknown case 'tubes'; use one of slide, cone, cone-load, tube"):
+        bench_socket(REFERENCE, "tubes", tell=silent)
 
 
 @pytest.fixture

@@ -18,13 +18,13 @@ import numpy as np
 from ..errors import InputError, ProblemError, RunError
 from ..execution import ProcessExecutor
 from ..fe import ELEMENTS, History, Indenter, OgdenQLV, Problem, StepControl, solve
-from ..febio import find_febio, read_log, run_febio
+from ..febio import find_febio, read_log, run_feb, run_febio
 from ..indentation import SiteModel
 from ..mesh import Mesh, to_tet10
 from ..mesh.cells import HEX, SIX_TETS, build_boxes
 from ..study import SolverTable
 from . import UNKNOWNS
-from .parity import PUNCHED, Tell, find_reference, load_case
+from .parity import GIVE_FOLDER, PUNCHED, SOCKET, Tell, find_reference, load_case
 
 Answer = TypeVar("Answer")
 CASES = {case.name: case for case in PUNCHED}
@@ -87,6 +87,52 @@ def bench_forward(
         "as_febio": as_febio,
         "febio_seconds": febio,
         "ratio": None if febio is None else febio / plain["seconds"],
+    }
+
+
+def bench_socket(
+    reference: Path | None = None,
+    case: str = "cone",
+    threads: int = 1,
+    beside_febio: bool = False,
+    *,
+    tell: Tell,
+) -> dict[str, Any]:
+    """Time FEBio's input of a socket on limbfit, with FEBio's steps and contact penalty; kernels are warm.
+
+    Parameters and errors are those of `bench_forward`; a case is one of the folder ``socket``.
+    """
+    program, cases = find_febio() if beside_febio else None, [one.name for one in SOCKET]
+    if case not in cases:
+        raise InputError(f"unknown case {case!r}", remedy=f"use one of {', '.join(cases)}")
+    folder = reference or find_reference(Path.cwd())
+    file = folder / "socket" / f"{case}.feb"
+    if not file.is_file():
+        raise InputError("is missing", file=file, remedy=GIVE_FOLDER)
+    tell(0, 2, f"{case} on limbfit")
+    found = run_in_fresh_process(solve_input_timed, threads, threads, file)
+    tell(1, 2, f"{found['seconds']:.1f} s on limbfit")
+    febio = None if program is None else time_febio(program, folder, f"socket/{case}", threads)
+    ratio = None if febio is None else febio / found["seconds"]
+    return {"case": case, **found, "threads": threads, "febio_seconds": febio, "ratio": ratio}
+
+
+def solve_input_timed(threads: int, file: Path) -> dict[str, Any]:
+    """Sizes, steps, seconds by part and largest memory of a FEBio input; its kernels are loaded before."""
+    with tempfile.TemporaryDirectory(prefix="limbfit-bench-") as out:
+        run_feb(file, out, times=(0.01,), threads=threads)  # compiles by one small step
+        result = run_feb(file, out, threads=threads).result
+    seconds = dict(result.statistics["seconds"])
+    return {
+        **{
+            key: result.statistics[key]
+            for key in ("unknowns", "steps", "newton_iterations", "factorisations")
+        },
+        "seconds": seconds.pop("total"),
+        "max_rss_MB": measure_max_rss_MB(),
+        "seconds_by_part": seconds,
+        "completed": result.completed,
+        "reason": result.reason,
     }
 
 

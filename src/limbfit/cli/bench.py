@@ -73,6 +73,18 @@ def forward(
 
 
 @app.command()
+def socket(
+    reference: Reference = None,
+    case: Annotated[str, Option(help="case of its folder socket: slide, cone, cone-load or tube")] = "cone",
+    threads: Threads = CORES,
+    beside_febio: BesideFebio = False,
+    as_json: AsJson = False,
+) -> None:
+    """Time FEBio's input of a socket that is donned or loaded, with FEBio's steps and contact."""
+    _bench("socket", limbfit.bench_socket, (reference, case, threads, beside_febio), show_facts, as_json)
+
+
+@app.command()
 def scaling(
     element: Annotated[str, Option(help="name in the element table")] = "tet10",
     large: Annotated[bool, Option("--large", help="also 125,000 to 300,000 unknowns")] = False,
