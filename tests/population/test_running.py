@@ -104,7 +104,8 @@ def test_dask_gives_the_same_table(tmp_path):
 
 @pytest.mark.slow
 def test_a_rule_is_made_robust_and_checked_on_fresh_people(tmp_path):
-    folder = make(tmp_path / "trial", TRIAL + "[robust]\nranges = { reduction_percent = [0.0, 5.0] }\n")
+    tight = TRIAL.replace('name = "tight"', 'name = "tight"\nsocket = { reduction_percent = 5.0 }')
+    folder = make(tmp_path / "trial", tight + "[robust]\nranges = { reduction_percent = [0.0, 5.0] }\n")
     found = limbfit.make_robust(folder, people=12, fresh=2)["robust"]
     # A looser socket presses less, and the limb's end bears.
     assert found["keys"]["reduction_percent"] < 2.0
