@@ -8,7 +8,7 @@ the fit.
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import cycle
+from itertools import chain, cycle
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +18,7 @@ from ...anatomy.sites.sites import compute_indenter_axis
 from ...anatomy.surfaces.surfaces import load_anatomy
 from ...arrays import Array
 from ...fe import ORDER_IN_TIME
-from ...indentation import SimulationJob, SiteModel, to_vector3
+from ...indentation import Simulation, SimulationJob, SiteModel, to_vector3
 from ...shapes import SHAPES
 from ...study import Study
 from ..engine.context import Context
@@ -67,14 +67,17 @@ def simulate_sources(
 ) -> list[Change]:
     """Simulate all variants of the study, on the meshes of the search, and the records as they are."""
     plain = [record.job(parameters, sensitivities=False) for record in records.searched]
-    variants = _build_variants(context, folder, records, plain)
-    jobs = plain + [job for variant in variants for job in variant.jobs]
+    answers = list(cache.run(plain, context.executor))
+    models = [_hold_penalty(job.model, answer) for job, answer in zip(plain, answers, strict=True)]
+    variants = _build_variants(context, folder, records, plain, models)
+    jobs = [job for variant in variants for job in variant.jobs]
     forces: list[Array | None] = []
-    for record, simulation in zip(cycle(records.own), cache.run(jobs, context.executor)):
+    for record, simulation in zip(cycle(records.own), chain(answers, cache.run(jobs, context.executor))):
         answer = simulation.force_N if record.seen is None else record.respond(simulation).force_N
         forces.append(answer if simulation.completed else None)
-        context.tell("uncertainty", len(forces), len(jobs), f"sources, site {simulation.site}")
-    before, *rows = (forces[i : i + len(plain)] for i in range(0, len(jobs), len(plain)))
+        total = len(plain) + len(jobs)
+        context.tell("uncertainty", len(forces), total, f"sources, site {simulation.site}")
+    before, *rows = (forces[i : i + len(plain)] for i in range(0, len(forces), len(plain)))
     found = []
     for variant, after in zip(variants, rows, strict=True):
         differences, failed = [], []
@@ -88,12 +91,22 @@ def simulate_sources(
     return found
 
 
+def _hold_penalty(model: SiteModel, answer: Simulation) -> SiteModel:
+    """The model with the contact penalty of its simulation: no source is mistaken for another penalty, and
+    none is searched for each variant by a simulation of its own."""
+    held = {"penalty_per_mm": answer.facts.get("penalty_per_mm")}
+    return replace(model, steps=model.steps.model_copy(update=held))
+
+
 def _build_variants(
-    context: Context, folder: Path, records: RecordSet, plain: Sequence[SimulationJob]
+    context: Context,
+    folder: Path,
+    records: RecordSet,
+    plain: Sequence[SimulationJob],
+    models: Sequence[SiteModel],
 ) -> list[SourceVariant]:
-    """All variants of the study, their meshes made."""
+    """All variants of the study, of ``models`` that hold their contact penalties; their meshes are made."""
     study, table, found = context.study, context.study.uncertainty, list[SourceVariant]()
-    models = [record.model for record in records.searched]
 
     def add(
         source: str, change: str, changed: Sequence[SiteModel], shared: bool, counted: bool, scale: float = 1
