@@ -10,11 +10,12 @@ import pytest
 from socket_limbs import CUT_NORMAL, round_limb
 
 from limbfit.anatomy.grid import build_limb_frame
-from limbfit.anatomy.surfaces.triangles import Surface, write_surface
+from limbfit.anatomy.surfaces.files import write_surface
+from limbfit.anatomy.surfaces.mending import close_by_fans
+from limbfit.anatomy.surfaces.triangles import Surface
 from limbfit.errors import SurfaceError
 from limbfit.socket import Recipe, Socket, read_socket, rectify_limb
 from limbfit.socket.rectify import Trim
-from limbfit.socket.shape import close_by_fans
 from limbfit.socket.wall import build_wall
 
 TRIM = Trim([(np.array([0.0, 0.0, 112.0]), CUT_NORMAL)])

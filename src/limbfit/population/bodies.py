@@ -11,7 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from ..anatomy.surfaces.extraction import remesh
-from ..anatomy.surfaces.triangles import SUFFIXES, Surface, find_half_edges, number_components, read_surface
+from ..anatomy.surfaces.files import SUFFIXES, read_surface
+from ..anatomy.surfaces.triangles import Surface, find_half_edges, number_components
 from ..arrays import Array, Indices
 from ..errors import InputError
 from ..extensions import import_extra

@@ -245,6 +245,16 @@ def open_loops(surface: Surface) -> list[Indices]:
     return loops
 
 
+def close_by_fans(surface: Surface) -> Surface:
+    """An open surface with each of its openings closed by a fan around the opening's middle."""
+    points, faces = [surface.points], [surface.faces]
+    for count, loop in enumerate(open_loops(surface)):
+        middle = np.full(len(loop), len(surface.points) + count)
+        points.append(surface.points[loop].mean(axis=0)[None])
+        faces.append(np.column_stack([np.roll(loop, -1), loop, middle]))
+    return Surface(np.vstack(points), np.vstack(faces))
+
+
 def _is_small(surface: Surface, loop: Indices) -> bool:
     points = surface.points[loop]
     if np.linalg.norm(np.ptp(points, axis=0)) <= SMALL_HOLE_MM:
