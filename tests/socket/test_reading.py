@@ -11,8 +11,7 @@ from socket_limbs import CUT_NORMAL, round_limb
 
 from limbfit.anatomy.grid import build_limb_frame
 from limbfit.anatomy.surfaces.files import write_surface
-from limbfit.anatomy.surfaces.mending import close_by_fans
-from limbfit.anatomy.surfaces.triangles import Surface
+from limbfit.anatomy.surfaces.triangles import Surface, close_by_fans
 from limbfit.errors import SurfaceError
 from limbfit.socket import Recipe, Socket, read_socket, rectify_limb
 from limbfit.socket.rectify import Trim

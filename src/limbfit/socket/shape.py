@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..anatomy.grid import Frame
-from ..anatomy.surfaces.mending import close_by_fans, open_loops
-from ..anatomy.surfaces.triangles import Surface
+from ..anatomy.surfaces.triangles import Surface, close_by_fans, open_loops
 from ..arrays import Array, Indices, Mask
 from ..errors import SurfaceError
 

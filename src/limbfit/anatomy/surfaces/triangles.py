@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -185,6 +186,13 @@ def remove_unused_points(surface: Surface) -> Surface:
     return Surface(surface.points[used], inverse.reshape(surface.faces.shape))
 
 
+def stack_surfaces(parts: Sequence[Surface]) -> Surface:
+    """Surfaces side by side in one."""
+    starts = np.cumsum([0, *(len(part.points) for part in parts)])
+    faces = [part.faces + start for part, start in zip(parts, starts)]
+    return Surface(np.concatenate([part.points for part in parts]), np.concatenate(faces))
+
+
 def find_bodies(surface: Surface) -> list[Surface]:
     """The connected bodies of a surface, the one with most faces first."""
     pieces = number_components(find_half_edges(surface.faces), len(surface.points))
@@ -204,6 +212,38 @@ def find_open_edges(faces: Indices) -> Indices:
     edges = find_half_edges(faces)
     _, inverse, counts = np.unique(np.sort(edges, axis=1), axis=0, return_inverse=True, return_counts=True)
     return edges[counts[inverse.ravel()] == 1]
+
+
+def open_loops(surface: Surface) -> list[Indices]:
+    """Points of each loop in the order of its faces' edges; loops that touch in a point are taken apart."""
+    following: dict[int, list[int]] = {}
+    for start, end in find_open_edges(surface.faces).tolist():
+        following.setdefault(start, []).append(end)
+    loops = []
+    while following:
+        way = [next(iter(following))]
+        while following.get(way[-1]):
+            here = following[way[-1]].pop()
+            if not following[way[-1]]:
+                del following[way[-1]]
+            if here in way:
+                at = way.index(here)
+                loops.append(np.array(way[at:]))
+                way = way[: at + 1]
+            else:
+                way.append(here)
+        following.pop(way[-1], None)
+    return loops
+
+
+def close_by_fans(surface: Surface) -> Surface:
+    """An open surface with each of its openings closed by a fan around the opening's middle."""
+    points, faces = [surface.points], [surface.faces]
+    for count, loop in enumerate(open_loops(surface)):
+        middle = np.full(len(loop), len(surface.points) + count)
+        points.append(surface.points[loop].mean(axis=0)[None])
+        faces.append(np.column_stack([np.roll(loop, -1), loop, middle]))
+    return Surface(np.vstack(points), np.vstack(faces))
 
 
 def has_turned_faces(faces: Indices) -> bool:

@@ -1,0 +1,137 @@
+"""Two shapes side by side: rigid registration, signed distances, and circumferences along an axis."""
+
+from collections.abc import Iterable
+
+import numpy as np
+from scipy.spatial import ConvexHull
+from scipy.spatial.transform import Rotation
+from vtkmodules.vtkCommonDataModel import vtkIterativeClosestPointTransform
+
+from ...arrays import Array
+from ...errors import SurfaceError
+from ...results.shapes import Circumference, ShapeComparison
+from .mending import find_flat_ends
+from .triangles import Surface, close_by_fans, cross_edges, find_bodies, find_open_edges, open_loops
+
+STEP_MM = 20.0  # between circumferences
+MIN_COSINE = 0.5  # between the proximal direction, as it is stated, and the normal of that end
+ROLLS = 8  # of the starts of a registration, around the long axis
+_FIRST_ROUNDS, _ROUNDS = (15, 300), (500, 4000)  # iterations and points of each start, and of the best one
+_MEAN_MM = 1e-4  # a registration ends where the mean distance changes less
+
+
+def orient_outside(surface: Surface) -> Surface:
+    """Look outward; with an open end, away from what it surrounds. Raises `SurfaceError` for several bodies,
+    open ends or holes.
+    """
+    if (count := len(find_bodies(surface))) > 1:
+        raise SurfaceError(f"{count} bodies in one file", remedy="choose one by --body: 1 is the largest")
+    if (count := len(open_loops(surface))) > 1:
+        raise SurfaceError(f"not closed: {count} open ends or holes", remedy="close all but the proximal end")
+    return surface if close_by_fans(surface).volume > 0.0 else surface.flipped_surface
+
+
+def find_axis(surface: Surface, proximal: Array) -> Array:
+    """The unit normal of its open, or else flat, proximal end, else its long axis, towards ``proximal``."""
+    fans = close_by_fans(surface).faces[len(surface.faces) :]
+    ends = [normal for _, normal in find_flat_ends(surface) if normal @ proximal > MIN_COSINE]
+    axis = ends[0] if len(ends) == 1 else _find_principal_axes(surface)[:, 2]
+    if len(fans):
+        area = cross_edges(close_by_fans(surface).points[fans]).sum(axis=0)
+        axis = area / np.linalg.norm(area)
+    return axis if axis @ proximal > 0.0 else -axis
+
+
+def _find_principal_axes(surface: Surface) -> Array:
+    """Columns: the principal axes of a surface, the longest last, right-handed."""
+    axes = np.linalg.eigh(np.cov(surface.triangles.mean(axis=1).T, aweights=surface.face_areas))[1]
+    return np.asarray(axes * [np.linalg.det(axes), 1.0, 1.0])
+
+
+def register_surface(moving: Surface, fixed: Surface) -> Surface:
+    """Move a surface rigidly onto another one by iterative closest points (VTK).
+
+    It starts as it lies, and with both long axes on each other, upright and upside down, in 8 rolls.
+    """
+    middle, target = moving.points.mean(axis=0), fixed.points.mean(axis=0)
+    ours, theirs = _find_principal_axes(moving), _find_principal_axes(fixed)
+    turns = [
+        Rotation.from_euler("zx", [2.0 * np.pi * k / ROLLS, np.pi * flip]).as_matrix()
+        for k in range(ROLLS)
+        for flip in range(2)
+    ]
+    places = [(moving.points - middle) @ (theirs @ turn @ ours.T).T + target for turn in turns]
+    found = [_match_points(place, moving, fixed, *_FIRST_ROUNDS) for place in (moving.points, *places)]
+    nearest = min(found, key=lambda points: float(fixed.find_nearest(points)[0].mean()))
+    return Surface(_match_points(nearest, moving, fixed, *_ROUNDS), moving.faces)
+
+
+def _match_points(points: Array, moving: Surface, fixed: Surface, rounds: int, most: int) -> Array:
+    """Points (n, 3) after that many rounds with so many of them."""
+    search = vtkIterativeClosestPointTransform()
+    search.SetSource(Surface(points, moving.faces).to_pyvista())
+    search.SetTarget(fixed.to_pyvista())
+    search.GetLandmarkTransform().SetModeToRigidBody()
+    search.SetMaximumNumberOfLandmarks(most)
+    search.SetMaximumNumberOfIterations(rounds)
+    search.CheckMeanDistanceOn()
+    search.SetMaximumMeanDistance(_MEAN_MM)
+    search.Update()
+    found = search.GetMatrix()
+    matrix = np.array([[found.GetElement(i, j) for j in range(4)] for i in range(3)])
+    return points @ matrix[:, :3].T + matrix[:, 3]
+
+
+def measure_circumferences(
+    surface: Surface, origin: Array, axis: Array, heights_mm: Iterable[float]
+) -> list[float | None]:
+    """Lengths of a tape around sections across an axis, mm; None where a section is open or is none.
+
+    A tape spans hollows: it has the length of the section's convex hull.
+    """
+    ends = [(surface.points[loop] - origin) @ axis for loop in open_loops(surface)]
+    across, poly = np.linalg.svd(axis[None])[2][1:], surface.to_pyvista()
+    lengths: list[float | None] = []
+    for height in heights_mm:
+        section = np.asarray(poly.slice(normal=axis, origin=origin + height * axis).points)
+        is_open = len(section) < 3 or any(end.min() <= height <= end.max() for end in ends)
+        lengths.append(None if is_open else float(ConvexHull(section @ across.T).area))
+    return lengths
+
+
+def measure_distances(here: Surface, there: Surface) -> tuple[Array, Array]:
+    """Signed distance (n,) of another surface at the points of an outward one, mm, positive where it lies
+    outside, and the area (n,) of these points, mm2: 0 where what is nearest is at an open edge.
+    """
+    squared, face, foot = there.find_nearest(here.points)
+    side = np.where(np.einsum("ij,ij->i", foot - here.points, here.vertex_normals) < 0.0, -1.0, 1.0)
+    area = np.bincount(here.faces.ravel(), np.repeat(here.face_areas / 3, 3), len(here.points))
+    at_edge = np.isin(there.faces[face], find_open_edges(there.faces)).any(axis=1)
+    return side * np.sqrt(squared), np.where(at_edge, 0.0, area)
+
+
+def compare_surfaces(first: Surface, second: Surface, axis: Array) -> ShapeComparison:
+    """Distances, measures, and circumferences of two outward surfaces, LPS mm, along a proximal axis (3,)."""
+    one, another = measure_distances(first, second), measure_distances(second, first)
+    distance, area = np.append(one[0], -another[0]), np.append(one[1], another[1])
+    if not area.any():
+        raise SurfaceError("the two shapes do not face each other", remedy="add --register")
+    return ShapeComparison(
+        axis=axis,  # type: ignore[arg-type]
+        max_mm=np.abs(distance[area > 0.0]).max(),
+        rms_mm=np.sqrt(np.average(distance**2, weights=area)),
+        mean_mm=np.average(distance, weights=area),
+        compared_percent=100.0 * area.sum() / (first.area + second.area),
+        lengths_mm=(np.ptp(first.points @ axis), np.ptp(second.points @ axis)),
+        volumes_cm3=(close_by_fans(first).volume / 1000.0, close_by_fans(second).volume / 1000.0),
+        circumferences=list_circumferences(first, second, axis),
+    )
+
+
+def list_circumferences(first: Surface, second: Surface, axis: Array) -> list[Circumference]:
+    """Circumferences of two surfaces every 20 mm over the distal end of the first."""
+    height = first.points @ axis
+    origin = first.points[height.argmin()]
+    heights = np.arange(STEP_MM, float(np.ptp(height)), STEP_MM).tolist()
+    rows = zip(heights, *(measure_circumferences(one, origin, axis, heights) for one in (first, second)))
+    return [Circumference(height_mm=h, first_mm=a, second_mm=b) for h, a, b in rows]
