@@ -106,7 +106,7 @@ def read_as_ampscan(file: Path) -> np.ndarray:
 def test_another_reader_sees_the_same_shape(stl: Path) -> None:
     convert_shape(stl, stl.with_suffix(".aop"))
     points = read_as_ampscan(stl.with_suffix(".aop"))
-    axis = find_axis(face().surface, CUT_NORMAL)
+    axis = find_axis(face().surface.flipped_surface, CUT_NORMAL)
     height = face().points @ axis
     middle = face().points[height < height.min() + 0.02].mean(axis=0)
     frame = build_limb_frame(middle + (height.min() - middle @ axis) * axis, axis)
@@ -140,6 +140,11 @@ def test_the_sense_of_the_spokes_must_be_stated_and_mirrors(tmp_path: Path) -> N
         ({14: "9"}, "the end of the file instead of a radius in mm, 9 slices of 4 in all"),
         ({20: "wide"}, "line 21: 'wide' instead of a radius"),
         ({20: "nan"}, "line 21: 'nan' instead of a radius"),
+        (
+            {2: "LIMBFIT FRAME LPS mm, clockwise: 1 2 3"},
+            "comment 'LIMBFIT FRAME LPS mm, clockwise:' is broken",
+        ),
+        ({27: "50\n50"}, "or more lines follow"),
     ],
 )
 def test_a_broken_file_of_slices_is_refused_with_its_line(tmp_path: Path, change: dict, words: str) -> None:

@@ -73,7 +73,7 @@ def test_round_trip(tmp_path: Path) -> None:
 
 def test_unit_and_space(tmp_path: Path) -> None:
     flipped = Surface(face().points * [-1e-3, -1e-3, 1e-3], face().faces)
-    write_surface(tmp_path / "ras.stl", flipped)
+    flipped.to_pyvista().save(tmp_path / "ras.stl")  # limbfit would state mm and LPS
     socket = read(tmp_path / "ras.stl", "m", "RAS")
     assert socket.volume_mm3 == pytest.approx(drawn().volume_mm3, rel=1e-4)
 

@@ -13,7 +13,7 @@ import numpy as np
 from ..anatomy.surfaces.bodies import name_bodies
 from ..anatomy.surfaces.extraction import remesh
 from ..anatomy.surfaces.files import SUFFIXES, read_surface
-from ..anatomy.surfaces.triangles import Surface
+from ..anatomy.surfaces.triangles import Surface, stack_surfaces
 from ..arrays import Array, Indices
 from ..errors import InputError
 from ..extensions import import_extra
@@ -87,12 +87,8 @@ def _read_limb(path: Path, unit: str) -> LimbBodies:
 
 
 def _stack_bodies(bodies: Mapping[str, Surface]) -> LimbBodies:
-    points, faces, start = [], {}, 0
-    for name, body in bodies.items():
-        points.append(body.points)
-        faces[name] = body.faces + start
-        start += len(body.points)
-    return LimbBodies(np.vstack(points), faces)
+    stacked, ends = stack_surfaces(list(bodies.values())), np.cumsum([len(b.faces) for b in bodies.values()])
+    return LimbBodies(stacked.points, dict(zip(bodies, np.split(stacked.faces, ends[:-1]), strict=True)))
 
 
 def _merge_corners(points: Array) -> tuple[Array, Indices]:

@@ -28,14 +28,6 @@ class ShapeComparison(ResultPart):
     circumferences: Sequence[Circumference] = Field(description="Every 20 mm along the axis.")
 
 
-class RegionDepth(ResultPart):
-    """How deep the socket is in the unloaded limb over a region."""
-
-    region: str = Field(description="Name of the region.")
-    mean_mm: float = Field(description="Mean depth; negative: outside of the limb.")
-    range_mm: Interval = Field(description="Least and greatest depth.")
-
-
 class ShopPackage(ResultPart):
     """Files of a socket for the shop, and its measures."""
 
@@ -45,4 +37,6 @@ class ShopPackage(ResultPart):
     trim_line_mm: float = Field(description="Length of the trim line.")
     volumes_cm3: Interval = Field(description="Of limb and liner, and of the socket up to its trim line.")
     circumferences: Sequence[Circumference] = Field(description="Of limb and liner, and inside the socket.")
-    depths: Sequence[RegionDepth] = Field(description="Depth over each region that the socket reaches.")
+    depths_mm: Mapping[str, Vector] = Field(
+        description="Mean, least and greatest depth in the unloaded limb over each region; negative: outside."
+    )

@@ -45,11 +45,11 @@ def test_the_package_holds_the_socket(tmp_path: Path) -> None:
     assert [row.height_mm for row in package.circumferences[:3]] == [20.0, 40.0, 60.0]
     for row in package.circumferences[1:3]:  # as the limb, but for the clearance
         assert row.second_mm == pytest.approx(row.first_mm, abs=0.5)
-    clearance = min(one.range_mm[0] for one in package.depths)
+    clearance = min(least for _, least, _ in package.depths_mm.values())
     assert clearance == pytest.approx(-3.0, abs=0.1)  # socket.distal_clearance_mm
     sheet = (shop / "check-sheet.html").read_text()
     assert (
         len(re.findall("<tr>", sheet))
-        == 4 + len([*package.files, *package.circumferences, *package.depths]) + 5
+        == 4 + len([*package.files, *package.circumferences, *package.depths_mm]) + 5
     )
     assert not any(word in sheet for word in (study.study.name, str(tmp_path), "20" + "26"))

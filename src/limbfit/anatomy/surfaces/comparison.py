@@ -14,7 +14,6 @@ from .mending import find_flat_ends
 from .triangles import Surface, close_by_fans, cross_edges, find_bodies, find_open_edges, open_loops
 
 STEP_MM = 20.0  # between circumferences
-MIN_COSINE = 0.5  # between the proximal direction, as it is stated, and the normal of that end
 ROLLS = 8  # of the starts of a registration, around the long axis
 _FIRST_ROUNDS, _ROUNDS = (15, 300), (500, 4000)  # iterations and points of each start, and of the best one
 _MEAN_MM = 1e-4  # a registration ends where the mean distance changes less
@@ -32,14 +31,12 @@ def orient_outside(surface: Surface) -> Surface:
 
 
 def find_axis(surface: Surface, proximal: Array) -> Array:
-    """The unit normal of its open, or else flat, proximal end, else its long axis, towards ``proximal``."""
-    fans = close_by_fans(surface).faces[len(surface.faces) :]
-    ends = [normal for _, normal in find_flat_ends(surface) if normal @ proximal > MIN_COSINE]
-    axis = ends[0] if len(ends) == 1 else _find_principal_axes(surface)[:, 2]
-    if len(fans):
-        area = cross_edges(close_by_fans(surface).points[fans]).sum(axis=0)
-        axis = area / np.linalg.norm(area)
-    return axis if axis @ proximal > 0.0 else -axis
+    """The unit normal of an open or flat end, or the long axis: whichever is nearest to ``proximal`` (3,)."""
+    longest = _find_principal_axes(surface)[:, 2]
+    open_end = cross_edges(close_by_fans(surface).triangles[len(surface.faces) :]).sum(axis=0)
+    ends = [normal for _, normal in find_flat_ends(surface)]
+    ends += [open_end / np.linalg.norm(open_end)] if open_end.any() else []
+    return max((*ends, longest, -longest), key=lambda axis: float(axis @ proximal))
 
 
 def _find_principal_axes(surface: Surface) -> Array:

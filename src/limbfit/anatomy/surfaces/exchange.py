@@ -45,6 +45,7 @@ def convert_shape(
     if target.exists() and target.samefile(source):
         raise InputError("is the file that is read", file=target, remedy="give the new file another name")
     surface, notes = read_body(source, **reading), tuple[str, ...]()
+    target.parent.mkdir(parents=True, exist_ok=True)
     with add_location(file=source):
         if close:
             mended = repair_surface(surface, "surface")
@@ -80,7 +81,9 @@ def compare_shapes(
     map_file : a .vtp for the signed distances at the first; positive where the second is outside.
     proximal, reading : as for `convert_shape`, for both files.
     """
-    up, shapes = _find_direction(proximal), []
+    up, shapes, target = _find_direction(proximal), [], Path(map_file or "none.vtp")
+    if target.suffix != ".vtp":
+        raise InputError("is no .vtp file", file=target, remedy="give the map a name that ends in .vtp")
     for file in (first, second):
         with add_location(file=file):
             shapes.append(orient_outside(read_body(file, **reading)))
@@ -90,7 +93,8 @@ def compare_shapes(
     if map_file is not None:
         mesh = here.to_pyvista()
         mesh.point_data["distance_mm"] = measure_distances(here, there)[0]
-        mesh.save(Path(map_file).with_suffix(".vtp"))
+        target.parent.mkdir(parents=True, exist_ok=True)
+        mesh.save(target)
     return found
 
 

@@ -30,6 +30,7 @@ MAX_GAP = 3.0  # between spokes, of the mean
 _END_MM = 0.05  # the height of the second slice; steps grow from there, as a round end asks for
 _LEVEL_MM = 0.02  # above the lowest point: what is as low
 _FRAME = "LIMBFIT FRAME LPS mm, clockwise:"
+_NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?", re.I)
 
 
 def read_slices(text: str, sense: Sense | None = None) -> tuple[Surface, bool]:
@@ -47,12 +48,11 @@ def read_slices(text: str, sense: Sense | None = None) -> tuple[Surface, bool]:
 
     def take(what: str, count: int = 1, least: float = 0.0) -> Array:
         nonlocal at
-        values = np.full(count, np.nan)
-        for k, line in enumerate(lines[at : at + count]):
-            word = line.partition(" ")[0]
-            values[k] = float(word) if re.fullmatch(r"[-+]?[\d.]+(e[-+]?\d+)?", word, re.I) else np.nan
-        if not (fine := (values >= least) & (values <= MAX_VALUES)).all():
-            at += int(fine.argmin())
+        words = [line.partition(" ")[0] for line in lines[at : at + count]]
+        values = np.array([float(word) if _NUMBER.fullmatch(word) else np.nan for word in words])
+        fine = (values >= least) & (values <= MAX_VALUES)
+        if not fine.all() or len(words) < count:
+            at += int(np.append(fine, False).argmin())
             text = repr(lines[at][:20]) if at < len(lines) else "the end of the file"
             raise SurfaceError(f"{text} instead of {what}", place=f"line {at + 1}", remedy="export it again")
         at += count
@@ -66,28 +66,34 @@ def read_slices(text: str, sense: Sense | None = None) -> tuple[Surface, bool]:
     for _ in range(int(take("the number of landmarks")[0])):
         at += 1  # its name
         take("a landmark's place", 3 * int(take("the number of a landmark's points")[0]), -np.inf)
-    words = next((line.removeprefix(_FRAME).split() for line in comments if line.startswith(_FRAME)), None)
-    if sense is None and words is None:
+    frame = next((_parse_frame(line) for line in comments if line.startswith(_FRAME)), None)
+    if sense is None and frame is None:
         raise SurfaceError(
             "does not say in which sense its spokes are counted, and the wrong one mirrors the shape",
             remedy="state it: limbfit shapes convert --spokes clockwise, or counter-clockwise",
         )
     turns, heights = take_ladder("spokes"), take_ladder("slices")
-    angles = np.mod(turns if sense == "counter-clockwise" else -90.0 - turns[1] - turns, 360.0)
+    is_turned = sense == "counter-clockwise" and frame is None
+    angles = np.mod(turns if is_turned else -90.0 - turns[1] - turns, 360.0)
     order = np.argsort(angles)
     gaps = np.diff(angles[order], append=angles[order[0]] + 360.0)
-    if gaps.min() <= 0.0 or gaps.max() > MAX_GAP * gaps.mean() or (np.diff(heights) <= 0.0).any():
-        what = "its spokes do not go around once, or its slices do not rise from the distal end"
+    stated = f"a radius in mm, {len(heights)} slices of {len(turns)} in all"
+    radii = take(stated, len(heights) * len(turns)).reshape(len(heights), -1)
+    is_even = gaps.min() > 0.0 and gaps.max() < MAX_GAP * gaps.mean() and (np.diff(heights) > 0.0).all()
+    if not is_even or any(lines[at:]):
+        what = "spokes do not go around once, slices do not rise from the end, or more lines follow"
         raise SurfaceError(what, remedy="export it again")
-    what = f"a radius in mm, {len(heights)} slices of {len(turns)} in all"
-    radii = take(what, len(heights) * len(turns)).reshape(len(heights), -1)
     surface = _build_rings(np.radians(angles[order]), heights, radii[:, order])
-    if words is None:
-        return surface, False
-    placed = np.array(words, dtype=float)
-    return Surface(
-        Frame(placed[3:].reshape(3, 3), placed[:3]).to_patient(surface.points), surface.faces
-    ), True
+    return (Surface(frame.to_patient(surface.points), surface.faces), True) if frame else (surface, False)
+
+
+def _parse_frame(line: str) -> Frame:
+    words = line.removeprefix(_FRAME).split()
+    values = np.array([float(word) if _NUMBER.fullmatch(word) else np.nan for word in words])
+    turn = values[3:].reshape(3, 3) if len(values) == 12 else np.zeros((3, 3))
+    if not np.allclose(turn @ turn.T, np.eye(3), atol=1e-6) or np.isnan(values).any():
+        raise SurfaceError(f"its comment {_FRAME!r} is broken", remedy="delete that line, or export it again")
+    return Frame(turn, values[:3])
 
 
 def _build_rings(angles: Array, heights: Array, radii: Array) -> Surface:

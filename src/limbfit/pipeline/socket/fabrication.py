@@ -1,6 +1,5 @@
 """A socket for the shop: its wall, slices and trim line, and a check sheet, in the folder ``shop``."""
 
-from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +10,7 @@ from ...anatomy.surfaces.slices import format_slices
 from ...anatomy.surfaces.triangles import Surface
 from ...errors import InputError
 from ...report.words import make_environment
-from ...results.shapes import RegionDepth, ShopPackage
+from ...results.shapes import ShopPackage
 from ...socket import Socket
 from ..engine.store import write_table
 from .shape import find_covered_regions
@@ -43,6 +42,9 @@ def write_shop_package(folder: Path, limb: SocketLimb, face: Socket, wall: Surfa
         files["shape.aop"] = "the shape inside, as slices; above the trim line it goes on straight"
     except InputError as error:
         left_out.append(f"shape.aop: {error}")
+    at = face.offset(limb.outer.skin)[face.faces].mean(axis=1)
+    middles = face.surface.triangles.mean(axis=1)
+    covered = find_covered_regions(middles, limb.anatomy.skin, limb.regions, face)
     package = ShopPackage(
         files=files | {SHEET: "circumferences, volumes and depths, to check what was made"},
         left_out=left_out,
@@ -50,16 +52,8 @@ def write_shop_package(folder: Path, limb: SocketLimb, face: Socket, wall: Surfa
         trim_line_mm=np.linalg.norm(trim - np.roll(trim, 1, axis=0), axis=1).sum(),
         volumes_cm3=(limb.outer.skin.volume / 1000.0, face.volume_mm3 / 1000.0),
         circumferences=list_circumferences(limb.outer.skin, outside, axis),
-        depths=list(_measure_depths(limb, face)),
+        depths_mm={name: (at[mask].mean(), at[mask].min(), at[mask].max()) for name, mask in covered.items()},
     )
     sheet = make_environment(autoescape=True).get_template("shop.html.j2")
     (shop / SHEET).write_text(sheet.render(package=package, axis=axis, wall=limb.study.socket.design.wall_mm))
     return package
-
-
-def _measure_depths(limb: SocketLimb, face: Socket) -> Iterable[RegionDepth]:
-    depth = face.offset(limb.outer.skin)[face.faces].mean(axis=1)
-    middles = face.surface.triangles.mean(axis=1)
-    for name, mask in find_covered_regions(middles, limb.anatomy.skin, limb.regions, face).items():
-        over = depth[mask]
-        yield RegionDepth(region=name, mean_mm=over.mean(), range_mm=(over.min(), over.max()))
