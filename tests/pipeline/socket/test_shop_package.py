@@ -42,9 +42,8 @@ def test_the_package_holds_the_socket(tmp_path: Path) -> None:
         trim = np.array([[float(value) for value in row.values()] for row in csv.DictReader(stream)])
     np.testing.assert_allclose(trim, face.points[face.brim], atol=1e-6)
     assert package.volumes_cm3[1] == pytest.approx(face.volume_mm3 / 1000.0)
-    assert [row.height_mm for row in package.circumferences[:3]] == [20.0, 40.0, 60.0]
-    for row in package.circumferences[1:3]:  # as the limb, but for the clearance
-        assert row.second_mm == pytest.approx(row.first_mm, abs=0.5)
+    row = package.circumferences[1]
+    assert row.second_mm == pytest.approx(row.first_mm, abs=0.5)  # nothing is reduced
     clearance = min(least for _, least, _ in package.depths_mm.values())
     assert clearance == pytest.approx(-3.0, abs=0.1)  # socket.distal_clearance_mm
     sheet = (shop / "check-sheet.html").read_text()

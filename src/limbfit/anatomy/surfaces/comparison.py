@@ -1,7 +1,5 @@
 """Two shapes side by side: rigid registration, signed distances, and circumferences along an axis."""
 
-from collections.abc import Iterable
-
 import numpy as np
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
@@ -79,23 +77,6 @@ def _match_points(points: Array, moving: Surface, fixed: Surface, rounds: int, m
     return points @ matrix[:, :3].T + matrix[:, 3]
 
 
-def measure_circumferences(
-    surface: Surface, origin: Array, axis: Array, heights_mm: Iterable[float]
-) -> list[float | None]:
-    """Lengths of a tape around sections across an axis, mm; None where a section is open or is none.
-
-    A tape spans hollows: it has the length of the section's convex hull.
-    """
-    ends = [(surface.points[loop] - origin) @ axis for loop in open_loops(surface)]
-    across, poly = np.linalg.svd(axis[None])[2][1:], surface.to_pyvista()
-    lengths: list[float | None] = []
-    for height in heights_mm:
-        section = np.asarray(poly.slice(normal=axis, origin=origin + height * axis).points)
-        is_open = len(section) < 3 or any(end.min() <= height <= end.max() for end in ends)
-        lengths.append(None if is_open else float(ConvexHull(section @ across.T).area))
-    return lengths
-
-
 def measure_distances(here: Surface, there: Surface) -> tuple[Array, Array]:
     """Signed distance (n,) of another surface at the points of an outward one, mm, positive where it lies
     outside, and the area (n,) of these points, mm2: 0 where what is nearest is at an open edge.
@@ -126,9 +107,21 @@ def compare_surfaces(first: Surface, second: Surface, axis: Array) -> ShapeCompa
 
 
 def list_circumferences(first: Surface, second: Surface, axis: Array) -> list[Circumference]:
-    """Circumferences of two surfaces every 20 mm over the distal end of the first."""
+    """Lengths of a tape around sections of two surfaces, every 20 mm over the distal end of the first.
+
+    A tape spans hollows: it has the length of a section's convex hull. None: the section is open, or is none.
+    """
     height = first.points @ axis
-    origin = first.points[height.argmin()]
-    heights = np.arange(STEP_MM, float(np.ptp(height)), STEP_MM).tolist()
-    rows = zip(heights, *(measure_circumferences(one, origin, axis, heights) for one in (first, second)))
-    return [Circumference(height_mm=h, first_mm=a, second_mm=b) for h, a, b in rows]
+    rows = []
+    for level in np.arange(height.min() + STEP_MM, height.max(), STEP_MM):
+        around = [_measure_circumference(one, axis, float(level)) for one in (first, second)]
+        rows.append(Circumference(height_mm=level - height.min(), first_mm=around[0], second_mm=around[1]))
+    return rows
+
+
+def _measure_circumference(surface: Surface, axis: Array, level: float) -> float | None:
+    section = np.asarray(surface.to_pyvista().slice(normal=axis, origin=level * axis).points)
+    ends = [surface.points[loop] @ axis for loop in open_loops(surface)]
+    if len(section) < 3 or any(end.min() <= level <= end.max() for end in ends):
+        return None
+    return float(ConvexHull(section @ np.linalg.svd(axis[None])[2][1:].T).area)

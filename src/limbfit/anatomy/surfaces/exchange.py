@@ -1,11 +1,10 @@
 """Shapes of limbs and sockets outside a study: written in another format, or compared."""
 
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
-from ...arrays import Array
 from ...errors import InputError, add_location
 from ...results.shapes import ShapeComparison
 from .bodies import read_body
@@ -14,6 +13,7 @@ from .files import read_surface, write_surface
 from .mending import repair_surface
 from .slices import TOLERANCE_MM, format_slices
 
+Direction = Literal["x", "-x", "y", "-y", "z", "-z"]
 _DIRECTIONS = {sign + "xyz"[k]: float(sign + "1") * np.eye(3)[k] for k in range(3) for sign in ("", "-")}
 
 
@@ -21,7 +21,7 @@ def convert_shape(
     source: str | Path,
     target: str | Path,
     *,
-    proximal: str = "z",
+    proximal: Direction = "z",
     close: bool = False,
     tolerance_mm: float = TOLERANCE_MM,
     **reading: Any,
@@ -41,7 +41,7 @@ def convert_shape(
         ``unit`` (mm, cm, m, inch), ``space`` (LPS, RAS), and ``spokes`` of AOP (clockwise, counter-clockwise,
         seen from the proximal end) where the file does not say them.
     """
-    target, up = Path(target), _find_direction(proximal)
+    target, up = Path(target), _DIRECTIONS[proximal]
     if target.exists() and target.samefile(source):
         raise InputError("is the file that is read", file=target, remedy="give the new file another name")
     surface, notes = read_body(source, **reading), tuple[str, ...]()
@@ -67,7 +67,7 @@ def compare_shapes(
     second: str | Path,
     *,
     register: bool = False,
-    proximal: str = "z",
+    proximal: Direction = "z",
     map_file: str | Path | None = None,
     **reading: Any,
 ) -> ShapeComparison:
@@ -81,7 +81,7 @@ def compare_shapes(
     map_file : a .vtp for the signed distances at the first; positive where the second is outside.
     proximal, reading : as for `convert_shape`, for both files.
     """
-    up, shapes, target = _find_direction(proximal), [], Path(map_file or "none.vtp")
+    up, shapes, target = _DIRECTIONS[proximal], [], Path(map_file or "none.vtp")
     if target.suffix != ".vtp":
         raise InputError("is no .vtp file", file=target, remedy="give the map a name that ends in .vtp")
     for file in (first, second):
@@ -96,10 +96,3 @@ def compare_shapes(
         target.parent.mkdir(parents=True, exist_ok=True)
         mesh.save(target)
     return found
-
-
-def _find_direction(letter: str) -> Array:
-    if letter not in _DIRECTIONS:
-        remedy = f"use one of {', '.join(_DIRECTIONS)}"
-        raise InputError(f"{letter!r} is no direction", place="--proximal", remedy=remedy)
-    return _DIRECTIONS[letter]

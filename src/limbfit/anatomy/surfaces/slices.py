@@ -1,12 +1,9 @@
 """Shapes as slices around an axis: AOP files, by which programs of prosthetists exchange limbs and sockets.
 
-Such a file is text with one value a line: comments up to END COMMENTS, CYLINDRICAL, the side, landmarks,
-angles of the spokes (deg) and heights of the slices (mm), one by one after a zero or by their step, and the
-radii (mm), slice by slice from the distal end.  The layout is that of the readers of ampscan (Steer et al.,
-JOSS 2020, 02060), with its example, and of aaop-utils (J. Watt, 2018).  They count spokes in opposite
-senses: ampscan clockwise, seen from the proximal end, until the last looks along -y; aaop-utils the other way
-from x on.  limbfit writes as ampscan reads, and a comment says so with the frame, so that a shape comes back
-where it was; of any other file the sense must be stated, as the wrong one mirrors the shape.
+The layout (docs/fabrication.md) is that of the readers of ampscan (Steer et al., JOSS 2020, 02060), with its
+example, and of aaop-utils (J. Watt, 2018).  These count spokes in opposite senses: ampscan clockwise, seen
+from the proximal end, until the last looks along -y; aaop-utils the other way from x on.  limbfit writes as
+ampscan reads, and a comment says so with the frame, so that a shape comes back where it was.
 """
 
 import re
