@@ -1,9 +1,11 @@
 """Two shapes side by side: rigid registration, signed distances, and circumferences along an axis."""
 
+from dataclasses import replace
+from typing import Any
+
 import numpy as np
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
-from vtkmodules.vtkCommonDataModel import vtkIterativeClosestPointTransform
 
 from ...arrays import Array
 from ...errors import SurfaceError
@@ -13,7 +15,7 @@ from .triangles import Surface, close_by_fans, cross_edges, find_bodies, find_op
 
 STEP_MM = 20.0  # between circumferences
 ROLLS = 8  # of the starts of a registration, around the long axis
-_FIRST_ROUNDS, _ROUNDS = (15, 300), (500, 4000)  # iterations and points of each start, and of the best one
+_FIRST_ROUNDS, _ROUNDS = (15, 300), (500, 4000)  # and points: of each start, of the best one
 _MEAN_MM = 1e-4  # a registration ends where the mean distance changes less
 
 
@@ -44,37 +46,26 @@ def _find_principal_axes(surface: Surface) -> Array:
 
 
 def register_surface(moving: Surface, fixed: Surface) -> Surface:
-    """Move a surface rigidly onto another one by iterative closest points (VTK).
+    """Move a surface rigidly onto another one by iterative closest points (VTK, by pyvista).
 
     It starts as it lies, and with both long axes on each other, upright and upside down, in 8 rolls.
     """
-    middle, target = moving.points.mean(axis=0), fixed.points.mean(axis=0)
+    from_middle, target = moving.points - moving.points.mean(axis=0), fixed.points.mean(axis=0)
     ours, theirs = _find_principal_axes(moving), _find_principal_axes(fixed)
-    turns = [
-        Rotation.from_euler("zx", [2.0 * np.pi * k / ROLLS, np.pi * flip]).as_matrix()
-        for k in range(ROLLS)
-        for flip in range(2)
-    ]
-    places = [(moving.points - middle) @ (theirs @ turn @ ours.T).T + target for turn in turns]
-    found = [_match_points(place, moving, fixed, *_FIRST_ROUNDS) for place in (moving.points, *places)]
+    angles = [(360.0 * k / ROLLS, flip) for k in range(ROLLS) for flip in (0.0, 180.0)]
+    turns = theirs @ Rotation.from_euler("zx", angles, degrees=True).as_matrix() @ ours.T
+    starts = [moving.points, *(from_middle @ turn.T + target for turn in turns)]
+
+    def match(points: Array, rounds: int, most: int) -> Array:
+        settings = {"max_landmarks": most, "max_iterations": rounds, "max_mean_distance": _MEAN_MM}
+        placed: Any = replace(moving, points=points).to_pyvista()
+        return np.asarray(
+            placed.align(fixed.to_pyvista(), start_by_matching_centroids=False, **settings).points
+        )
+
+    found = [match(start, *_FIRST_ROUNDS) for start in starts]
     nearest = min(found, key=lambda points: float(fixed.find_nearest(points)[0].mean()))
-    return Surface(_match_points(nearest, moving, fixed, *_ROUNDS), moving.faces)
-
-
-def _match_points(points: Array, moving: Surface, fixed: Surface, rounds: int, most: int) -> Array:
-    """Points (n, 3) after that many rounds with so many of them."""
-    search = vtkIterativeClosestPointTransform()
-    search.SetSource(Surface(points, moving.faces).to_pyvista())
-    search.SetTarget(fixed.to_pyvista())
-    search.GetLandmarkTransform().SetModeToRigidBody()
-    search.SetMaximumNumberOfLandmarks(most)
-    search.SetMaximumNumberOfIterations(rounds)
-    search.CheckMeanDistanceOn()
-    search.SetMaximumMeanDistance(_MEAN_MM)
-    search.Update()
-    found = search.GetMatrix()
-    matrix = np.array([[found.GetElement(i, j) for j in range(4)] for i in range(3)])
-    return points @ matrix[:, :3].T + matrix[:, 3]
+    return replace(moving, points=match(nearest, *_ROUNDS))
 
 
 def measure_distances(here: Surface, there: Surface) -> tuple[Array, Array]:
