@@ -236,5 +236,8 @@ def test_other_bad_input_is_one_line(tmp_path: Path) -> None:
         with pytest.raises(InputError, match=re.escape(words)) as refused:
             convert_shape(tmp_path / source, tmp_path / target)
         assert "\n" not in str(refused.value)
+    round_limb().skin.to_pyvista().save(tmp_path / "skin.stl")  # in mm, and does not say so
+    with pytest.raises(InputError, match=r"1\.5e\+05 mm long; state its unit"):
+        convert_shape(tmp_path / "skin.stl", tmp_path / "skin.aop", unit="m")
     with pytest.raises(InputError, match=r"map\.png: is no \.vtp file"):
         compare_shapes(tmp_path / "skin.vtp", tmp_path / "skin.vtp", map_file="map.png")

@@ -23,6 +23,7 @@ SPOKES, SLICE_MM = 360, 1.0
 MAX_ROUNDS = 5  # of closer slices
 GOES_ON_MM = 1.0  # above the brim a flare goes on so far
 MAX_VALUES = 20_000_000
+MIN_LENGTH_MM, MAX_LENGTH_MM = 10.0, 3000.0  # of a shape: otherwise another unit
 MAX_GAP = 3.0  # between spokes, of the mean
 _END_MM = 0.05  # the height of the second slice; steps grow from there, as a round end asks for
 _LEVEL_MM = 0.02  # above the lowest point: what is as low
@@ -119,6 +120,8 @@ def format_slices(
     side : of the limb: LEFT, RIGHT or NONE.
     """
     loops, height = open_loops(surface), surface.points @ proximal
+    if not MIN_LENGTH_MM < np.ptp(height) < MAX_LENGTH_MM:
+        raise SurfaceError(f"it is {np.ptp(height):.3g} mm long", remedy="state its unit (--unit)")
     if len(loops) > 1 or any(height[loop].min() < np.median(height) for loop in loops):
         what = f"the surface has {len(loops)} open ends or holes" if loops[1:] else "it opens distally"
         raise SurfaceError(what, remedy="close all but its proximal end, or state --proximal")
