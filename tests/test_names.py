@@ -13,21 +13,21 @@ VERBS = frozenset(
 acquire adapt add advance amputate announce append apply approach approximate assemble assess assign
 average balance batch begin bench bisect build bump calibrate call cap change check choose clamp
 classify clean clear clip close coarsen code collect combine compare compile compress compute
-connect constrain continue convolve copy correct count couple create cross curve cut decode deform delay
-demo derive describe design diagnose die dilate divide do draw drop edit embed
-equilibrate erode estimate evaluate expand explain explore export extend extract extrapolate extrude
-fail fill find finish fit flatten follow format from generate get grade group grow guess has hold ignore
-import impose improve insert integrate interpolate interpret interrupt intersect invert is iterate join
-judge keep label level limit link list listen load locate lock log lump main make mark match measure
-mend merge mesh minimise mix move multiply mute name normalise number observe open optimise orient
-outline pack paint pair parse place plan plot pool post predict prefetch prepare prepend press preview
-print prioritise project prolong prompt pull rank rasterise read record recover rectify redact
-reduce refactor refine refit refuse register regularise release remesh remove render renew repair
-replace report reproduce resample rescale resolve respond restate restrict resume rotate round run
-sample save scale schedule search segment select send serve set share shorten show silence simulate
-smooth snap solve split spread stack start state step stop store sum summarise take tell temper
-test thicken thin time to touch transfer translate triangulate trim try turn unpack untangle update vary
-voxelise walk warm warn weigh whiten widen wrap write
+connect constrain continue convert convolve copy correct count couple create cross curve cut decode
+deform delay demo derive describe design diagnose die dilate divide do draw drop edit embed equilibrate
+erode estimate evaluate expand explain explore export extend extract extrapolate extrude fail fill find
+finish fit flatten follow format from generate get grade group grow guess has hold ignore import impose
+improve insert integrate interpolate interpret interrupt intersect invert is iterate join judge keep
+label level limit link list listen load locate lock log lump main make mark match measure mend merge
+mesh minimise mix move multiply mute name normalise number observe open optimise orient outline pack
+paint pair parse place plan plot pool post predict prefetch prepare prepend press preview print
+prioritise project prolong prompt pull rank rasterise read record recover rectify redact reduce refactor
+refine refit refuse register regularise release remesh remove render renew repair replace report
+reproduce resample rescale resolve respond restate restrict resume rotate round run sample save scale
+schedule search segment select send serve set share shorten show silence simulate smooth snap solve
+split spread stack start state step stop store sum summarise take tell temper test thicken thin time to
+touch transfer translate triangulate trim try turn unpack untangle update vary voxelise walk warm warn
+weigh whiten widen wrap write
     """.split()  # noqa: SIM905
 )
 PREDICATES = frozenset({"is", "has", "can", "are", "prefers"})

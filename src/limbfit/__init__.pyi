@@ -3,6 +3,10 @@
 from ._version import __version__ as __version__
 from .anatomy.images.dicom import describe_series as describe_series
 from .anatomy.images.formats import register_image_format as register_image_format
+from .anatomy.surfaces.exchange import (
+    compare_shapes as compare_shapes,
+    convert_shape as convert_shape,
+)
 from .bench.meshing import bench_meshing as bench_meshing
 from .bench.parity import bench_febio_parity as bench_febio_parity
 from .bench.timing import (

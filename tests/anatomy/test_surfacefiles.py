@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 import pyvista as pv
 
-from limbfit.anatomy.surfaces.triangles import UNITS_MM, check_closed, read_surface
+from limbfit.anatomy.surfaces.files import UNITS_MM, read_surface
+from limbfit.anatomy.surfaces.triangles import check_closed
 from limbfit.errors import SurfaceError
 
 

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from limbfit.anatomy.surfaces.triangles import Surface, from_pyvista, write_surface
+from limbfit.anatomy.surfaces.files import write_surface
+from limbfit.anatomy.surfaces.triangles import Surface, from_pyvista
 from limbfit.errors import InputError
 from limbfit.population.bodies import name_bodies, read_bodies, register_limbs
 from limbfit.population.shape_model import ShapeModel, build_shape_model

@@ -5,9 +5,10 @@ from pathlib import Path
 
 import numpy as np
 
+from limbfit.anatomy.surfaces.files import read_surface
 from limbfit.anatomy.surfaces.mending import build_closed_anatomy
 from limbfit.anatomy.surfaces.surfaces import Anatomy
-from limbfit.anatomy.surfaces.triangles import Surface, find_bodies, read_surface
+from limbfit.anatomy.surfaces.triangles import Surface, find_bodies
 from limbfit.socket.shape import cut_section
 
 SHARED = Path(__file__).parents[2] / ".." / "shared" / "data"

@@ -10,11 +10,11 @@ import pytest
 from socket_limbs import CUT_NORMAL, round_limb
 
 from limbfit.anatomy.grid import build_limb_frame
-from limbfit.anatomy.surfaces.triangles import Surface, write_surface
+from limbfit.anatomy.surfaces.files import write_surface
+from limbfit.anatomy.surfaces.triangles import Surface, close_by_fans
 from limbfit.errors import SurfaceError
 from limbfit.socket import Recipe, Socket, read_socket, rectify_limb
 from limbfit.socket.rectify import Trim
-from limbfit.socket.shape import close_by_fans
 from limbfit.socket.wall import build_wall
 
 TRIM = Trim([(np.array([0.0, 0.0, 112.0]), CUT_NORMAL)])
@@ -73,7 +73,7 @@ def test_round_trip(tmp_path: Path) -> None:
 
 def test_unit_and_space(tmp_path: Path) -> None:
     flipped = Surface(face().points * [-1e-3, -1e-3, 1e-3], face().faces)
-    write_surface(tmp_path / "ras.stl", flipped)
+    flipped.to_pyvista().save(tmp_path / "ras.stl")  # limbfit would state mm and LPS
     socket = read(tmp_path / "ras.stl", "m", "RAS")
     assert socket.volume_mm3 == pytest.approx(drawn().volume_mm3, rel=1e-4)
 

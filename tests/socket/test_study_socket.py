@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 from socket_limbs import CUT_NORMAL, round_limb
 
+from limbfit.anatomy.surfaces.files import write_surface
 from limbfit.anatomy.surfaces.surfaces import Anatomy
-from limbfit.anatomy.surfaces.triangles import Surface, write_surface
+from limbfit.anatomy.surfaces.triangles import Surface
 from limbfit.errors import StudyError
 from limbfit.mesh import Mesh
 from limbfit.pipeline.commands.check import check_study

@@ -10,7 +10,8 @@ import trimesh
 from socket_limbs import CUT_NORMAL, FILES, real_limb, round_limb
 
 from limbfit.anatomy.grid import build_limb_frame
-from limbfit.anatomy.surfaces.triangles import Surface, write_surface
+from limbfit.anatomy.surfaces.files import write_surface
+from limbfit.anatomy.surfaces.triangles import Surface
 from limbfit.errors import SurfaceError
 from limbfit.socket import Area, Recipe, Socket, rectify_limb
 from limbfit.socket.landmarks import find_knee_centre

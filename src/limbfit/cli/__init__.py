@@ -15,7 +15,7 @@ from typer.core import TyperGroup
 from .._version import __version__
 from ..errors import InputError, LimbfitError
 from ..execution import SAFE_PATH
-from . import acquire, bench, commands, experiments, febio, population, runs, socket
+from . import acquire, bench, commands, experiments, febio, population, runs, shapes, socket
 from .console import INTERRUPTED, fail, print_line, prompt_interrupt
 
 GROUPS: Mapping[str, tuple[str, ...]] = {
@@ -63,7 +63,7 @@ for verb in (*commands.VERBS, *experiments.VERBS, *febio.VERBS, *runs.VERBS, *ac
     app.command()(runs.add_execution_options(verb) if verb in _WITH_JOBS else verb)
 app.add_typer(socket.app, name="socket")
 app.add_typer(population.app, name="population")
-app.add_typer(population.shapes, name="shapes")
+app.add_typer(shapes.app, name="shapes")
 app.add_typer(bench.app, name="bench")
 
 

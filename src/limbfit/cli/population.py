@@ -1,14 +1,14 @@
-"""``limbfit population``: a trial on virtual people; ``limbfit shapes``: models of the shapes of limbs."""
+"""``limbfit population``: a trial on virtual people."""
 
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import typer
 
 import limbfit
 
 from ..errors import InputError
-from ..results.population import WORST_PLACE, PopulationResult, ShapeModelResult
+from ..results.population import WORST_PLACE, PopulationResult
 from .console import (
     AsJson,
     Column,
@@ -26,7 +26,6 @@ app = typer.Typer(
     no_args_is_help=True,
     rich_markup_mode=None,
 )
-shapes = typer.Typer(help="Models of the shapes of limbs.", no_args_is_help=True, rich_markup_mode=None)
 TrialPath = Annotated[Path, typer.Argument(help="population.toml or its folder", show_default=False)]
 LEAST_SHARE = 0.01  # a driver with less is not printed
 
@@ -175,62 +174,6 @@ def show_population(found: PopulationResult) -> None:
             f"{format_ends(made.interval_kPa, '.1f')})"
         )
     print_warnings(found.notes)
-
-
-@shapes.command()
-def model(
-    limbs: Annotated[
-        list[Path], typer.Argument(help="a file with all bodies of a limb, or a folder of bodies, each")
-    ],
-    out: Annotated[Path, typer.Option(help="the file of the model")] = Path("limbs.npz"),
-    unit: Annotated[Literal["mm", "cm", "m", "inch"], typer.Option(help="of the files")] = "mm",
-    register: Annotated[
-        bool, typer.Option("--register", help="not in correspondence: bend the first limb onto the others")
-    ] = False,
-    mean: Annotated[
-        Path | None, typer.Option(help="the limbs are deviations of this mean, along modes")
-    ] = None,
-    at: Annotated[float, typer.Option(help="with --mean: of so many standard deviations", min=0.1)] = 2.0,
-    as_json: AsJson = False,
-) -> None:
-    """Make a shape model of limbs: their mean, and the modes in which they differ."""
-    made = limbfit.build_shape_model(limbs, unit=unit, register=register, mean=mean, at=at)
-    made.write(out)
-
-    def show(figures: dict[str, Any]) -> None:
-        show_shape_model(ShapeModelResult.model_validate(figures))
-        print_line(f"stored in {out}")
-
-    print_result(made.figures.to_plain(), show, as_json)
-
-
-def show_shape_model(figures: ShapeModelResult) -> None:
-    """The figures of a model, mode by mode."""
-    print_line(f"{figures.limbs} limbs of {figures.points} points: {', '.join(figures.bodies)}")
-    left_out = figures.left_out_mm or ()
-    rows = [
-        {
-            "mode": i + 1,
-            "share": 100 * share,
-            "move": move,
-            "left": left_out[i] if i < len(left_out) else None,
-        }
-        for i, (share, move) in enumerate(zip(figures.explained, figures.deviation_mm, strict=True))
-    ]
-    columns: dict[str, Column] = {
-        "modes": "mode",
-        "variance explained (%)": ("share", ".1f"),
-        "one deviation (mm)": ("move", ".2f"),
-        "a limb left out (mm)": ("left", ".2f"),
-    }
-    print_table(rows, columns)
-    if figures.specificity_mm is not None:
-        print_line(f"specificity: drawn limbs are {figures.specificity_mm:.1f} mm from the nearest one (RMS)")
-    if figures.registration_rms_mm is not None:
-        print_line(
-            f"registered within {figures.registration_rms_mm:.2f} mm (RMS), 5 % of the points beyond "
-            f"{figures.registration_p95_mm:.2f} mm, for the worst limb"
-        )
 
 
 for verb in (run, person, robust):

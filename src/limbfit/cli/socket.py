@@ -171,6 +171,9 @@ def show_design(found: SocketDesignResult) -> None:
         print_line(f"* optimised in {len(optimisation.trials) - 1} simulations; {rest}")
     thickness = f"{wall.stated_mm:g} mm, measured {wall.least_mm:.2f} mm at least"
     print_line(f"socket.stl: the {wall.of} with a wall of {thickness}; not a medical device")
+    if found.shop:
+        print_line(f"for the shop, in shop: {', '.join(found.shop.files)}")
+        print_warnings(found.shop.left_out)
 
 
 def _check_choice(parameters: str | None, literature: bool) -> None:

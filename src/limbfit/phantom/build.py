@@ -27,8 +27,8 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from scipy.interpolate import interp1d
 
 from ..anatomy.imaging import write_labels
+from ..anatomy.surfaces.files import write_surface
 from ..anatomy.surfaces.surfaces import Anatomy, Surface, save_anatomy
-from ..anatomy.surfaces.triangles import write_surface
 from ..arrays import Array
 from ..errors import InputError
 from ..indentation import Parameters

@@ -10,14 +10,15 @@ from pathlib import Path
 
 import numpy as np
 
+from ..anatomy.surfaces.bodies import name_bodies
 from ..anatomy.surfaces.extraction import remesh
-from ..anatomy.surfaces.triangles import SUFFIXES, Surface, find_half_edges, number_components, read_surface
+from ..anatomy.surfaces.files import SUFFIXES, read_surface
+from ..anatomy.surfaces.triangles import Surface, stack_surfaces
 from ..arrays import Array, Indices
 from ..errors import InputError
 from ..extensions import import_extra
 
 ALL = ""  # the name of all bodies together, before they are told apart
-SMALLEST_FACES = 100  # of a body; what is smaller is left over from a segmentation
 TEMPLATE_EDGE_MM = 6.0  # of the limb that is bent onto the others
 SAME_POINT_MM = 0.01  # where corners of a file without shared points are one point
 # Steps of Amberg et al.: stiffness, weight of landmarks (there are none), weight of normals, iterations.
@@ -86,12 +87,8 @@ def _read_limb(path: Path, unit: str) -> LimbBodies:
 
 
 def _stack_bodies(bodies: Mapping[str, Surface]) -> LimbBodies:
-    points, faces, start = [], {}, 0
-    for name, body in bodies.items():
-        points.append(body.points)
-        faces[name] = body.faces + start
-        start += len(body.points)
-    return LimbBodies(np.vstack(points), faces)
+    stacked, ends = stack_surfaces(list(bodies.values())), np.cumsum([len(b.faces) for b in bodies.values()])
+    return LimbBodies(stacked.points, dict(zip(bodies, np.split(stacked.faces, ends[:-1]), strict=True)))
 
 
 def _merge_corners(points: Array) -> tuple[Array, Indices]:
@@ -102,39 +99,6 @@ def _merge_corners(points: Array) -> tuple[Array, Indices]:
 
 def _is_same(faces: Mapping[str, Indices], others: Mapping[str, Indices]) -> bool:
     return faces.keys() == others.keys() and all(np.array_equal(faces[k], others[k]) for k in faces)
-
-
-def name_bodies(surface: Surface, file: Path) -> dict[str, Indices]:
-    """Tell the bodies of a surface apart, by size and place; z is proximal.
-
-    The skin is the largest. Of one bone it is the femur (a thigh), of two tibia and fibula; of four the femur
-    is the larger, and the patella the smaller of the two that are higher.
-
-    Raises
-    ------
-    InputError
-        For another number of bodies.
-    """
-    pieces = number_components(find_half_edges(surface.faces), len(surface.points))[surface.faces[:, 0]]
-    bodies = [surface.faces[pieces == one] for one in np.unique(pieces)]
-    bodies = [one for one in bodies if len(one) >= SMALLEST_FACES]
-    bodies.sort(key=lambda one: -float(np.prod(np.ptp(surface.points[one].reshape(-1, 3), axis=0))))
-    skin, *bones = bodies or [np.zeros((0, 3), dtype=np.int64)]
-    bones.sort(key=lambda one: float(surface.points[one][..., 2].mean()))
-    match len(bones):
-        case 1:
-            return {"skin": skin, "femur": bones[0]}
-        case 2:
-            fibula, tibia = sorted(bones, key=len)
-            return {"skin": skin, "tibia": tibia, "fibula": fibula}
-        case 4:
-            (fibula, tibia), (patella, femur) = sorted(bones[:2], key=len), sorted(bones[2:], key=len)
-            return {"skin": skin, "femur": femur, "patella": patella, "tibia": tibia, "fibula": fibula}
-    raise InputError(
-        f"{len(bodies)} bodies, which cannot be told apart",
-        file=file,
-        remedy="give each limb as a folder with a file for each body: skin.stl, tibia.stl, ...",
-    )
 
 
 @dataclass(frozen=True)

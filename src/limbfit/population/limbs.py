@@ -12,7 +12,8 @@ from pathlib import Path
 import numpy as np
 from scipy.stats import truncnorm
 
-from ..anatomy.surfaces.triangles import SUFFIXES, Surface
+from ..anatomy.surfaces.files import SUFFIXES
+from ..anatomy.surfaces.triangles import Surface
 from ..arrays import Array
 from ..errors import InputError
 from ..phantom.geometry import LIMBS, Limb, LimbShape, build_true_anatomy, compute_surface_point

@@ -13,8 +13,8 @@ import numpy as np
 import tomlkit
 from scipy.stats import norm, qmc
 
+from ..anatomy.surfaces.files import write_surface
 from ..anatomy.surfaces.surfaces import Anatomy
-from ..anatomy.surfaces.triangles import write_surface
 from ..arrays import Array
 from ..errors import InputError, SurfaceError
 from ..laws import Parameters, list_flat_names

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..anatomy.surfaces.triangles import UNITS_MM
+from ..anatomy.surfaces.files import UNITS_MM
 from ..arrays import Array, Indices
 from ..errors import InputError
 from ..results.population import ShapeModelResult

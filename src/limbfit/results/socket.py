@@ -8,6 +8,7 @@ from pydantic import Field
 from .base import Interval, Parameters, ResultPart, StoredResult, Vector
 from .identification import OutsideRecords, QuantityRange
 from .limb import MeshMeasures
+from .shapes import ShopPackage
 
 
 class LoadedRegion(ResultPart):
@@ -251,6 +252,7 @@ class SocketDesignResult(StoredResult):
     designs: Sequence[SocketDesigned] = Field(description="Each design.")
     optimisation: SocketOptimisation | None = Field(description="The search for lower pressures; null: none.")
     wall: SocketWall = Field(description="The wall of the last design.")
+    shop: ShopPackage | None = Field(default=None, description="Its package for the shop.")
     parameters: Parameters = Field(description="The parameters of the tissues.")
     parameters_from: str = Field(description="Where these are from.")
     liner: LinerFacts = Field(description="The liner.")

@@ -7,13 +7,14 @@ from typing import Literal
 import numpy as np
 
 from ..anatomy.grid import Frame
-from ..anatomy.surfaces.mending import count_turned, open_loops, orient_faces
+from ..anatomy.surfaces.files import read_surface
+from ..anatomy.surfaces.mending import count_turned, orient_faces
 from ..anatomy.surfaces.triangles import (
     Surface,
     check_sides,
     find_bodies,
     find_half_edges,
-    read_surface,
+    open_loops,
     remove_unused_points,
 )
 from ..arrays import Array, Indices

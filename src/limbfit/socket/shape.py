@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..anatomy.grid import Frame
-from ..anatomy.surfaces.mending import open_loops
-from ..anatomy.surfaces.triangles import Surface
+from ..anatomy.surfaces.triangles import Surface, close_by_fans, open_loops
 from ..arrays import Array, Indices, Mask
 from ..errors import SurfaceError
 
@@ -61,16 +60,6 @@ class Socket:
     def offset(self, limb: Surface) -> Array:
         """(n,) how deep each point lies inside a closed limb surface, mm; negative outside."""
         return -limb.signed_distance(self.points)
-
-
-def close_by_fans(surface: Surface) -> Surface:
-    """An open surface with each of its openings closed by a fan around the opening's middle."""
-    points, faces = [surface.points], [surface.faces]
-    for count, loop in enumerate(open_loops(surface)):
-        middle = np.full(len(loop), len(surface.points) + count)
-        points.append(surface.points[loop].mean(axis=0)[None])
-        faces.append(np.column_stack([np.roll(loop, -1), loop, middle]))
-    return Surface(np.vstack(points), np.vstack(faces))
 
 
 def cut_section(surface: Surface, point: ArrayLike, normal: ArrayLike) -> Array:

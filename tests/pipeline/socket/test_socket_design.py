@@ -132,6 +132,9 @@ def test_the_printable_socket_is_watertight_and_as_thick_as_stated(designed, fol
     assert told["volume_cm3"] == pytest.approx(body.volume / 1000.0, rel=1e-3)
     assert told["median_mm"] == pytest.approx(3.0, rel=0.02)
     assert told["least_mm"] > 0.85 * 3.0
+    shop = folder / "results" / "socket_design" / "shop"
+    assert {file.name for file in shop.iterdir()} == set(designed["shop"]["files"])
+    assert designed["shop"]["aop_deviation_mm"] < 0.1
 
 
 @pytest.mark.slow

@@ -24,7 +24,7 @@ from ..grid import format_place
 from . import triangles
 from .extraction import untangle_surface
 from .surfaces import Anatomy, check_anatomy
-from .triangles import Surface
+from .triangles import Surface, open_loops
 
 SMALL_HOLE_MM = 10.0  # a hole that is no wider is filled
 SMALL_HOLE_EDGES, SMALL_HOLE_SHARE = 6, 0.02  # so is one of few edges that is a small share of the surface
@@ -216,33 +216,9 @@ def _remove_loose_pieces(surface: Surface, name: str) -> tuple[Surface, tuple[st
     if not loose:
         return surface, ()
     kept = [main, *(part for part in others if not any(part is piece for piece in loose))]
-    starts = np.cumsum([0, *(len(part.points) for part in kept)])
-    faces = np.concatenate([part.faces + start for part, start in zip(kept, starts)])
     count, where = sum(len(part.faces) for part in loose), format_place(loose[0].points.mean(axis=0))
     note = f"{name}: {len(loose)} loose pieces of {count} triangles left out, the first at {where}"
-    return Surface(np.concatenate([part.points for part in kept]), faces), (note,)
-
-
-def open_loops(surface: Surface) -> list[Indices]:
-    """Points of each loop in the order of its faces' edges; loops that touch in a point are taken apart."""
-    following: dict[int, list[int]] = {}
-    for start, end in triangles.find_open_edges(surface.faces).tolist():
-        following.setdefault(start, []).append(end)
-    loops = []
-    while following:
-        way = [next(iter(following))]
-        while following.get(way[-1]):
-            here = following[way[-1]].pop()
-            if not following[way[-1]]:
-                del following[way[-1]]
-            if here in way:
-                at = way.index(here)
-                loops.append(np.array(way[at:]))
-                way = way[: at + 1]
-            else:
-                way.append(here)
-        following.pop(way[-1], None)
-    return loops
+    return triangles.stack_surfaces(kept), (note,)
 
 
 def _is_small(surface: Surface, loop: Indices) -> bool:

@@ -21,14 +21,13 @@ from ...results.limb import SurfaceMeasures, SurfacesResult
 from ..grid import Frame, LabelMap, ProximalEnd, build_limb_frame, find_proximal_end, select_layer
 from ..morphology import find_box
 from .extraction import extract_fine_surface, extract_surface, remesh
+from .files import read_surface, write_surface
 from .triangles import (
     Surface,
     check_closed,
     find_bodies,
     find_half_edges,
     from_pyvista,
-    read_surface,
-    write_surface,
 )
 
 ON_CUT_MM = 0.1  # nearer to the proximal cut, a point lies on it: flat ends of files are flat to half of that

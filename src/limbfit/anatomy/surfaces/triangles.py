@@ -1,33 +1,25 @@
-"""Closed triangle surfaces: the type, the search for nearest points, and whether one may bound a body.
-
-Also their files: STL, PLY, VTP, OBJ, in LPS or RAS, in millimetres or a stated unit.
-"""
+"""Closed triangle surfaces: the type, the search for nearest points, and whether one may bound a body."""
 
 from __future__ import annotations
 
-import re
-import warnings
-from collections.abc import Mapping
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import igl
-import meshio
 import numpy as np
 import pyvista as pv
 from igl.predicates import find_self_intersections
 from numpy.typing import ArrayLike
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
-from vtkmodules.util.numpy_support import vtk_to_numpy
 from vtkmodules.vtkCommonCore import vtkIdList, vtkPoints
 from vtkmodules.vtkCommonDataModel import vtkStaticCellLocator
 
 from ...arrays import Array, Indices
 from ...errors import SurfaceError, add_location
-from ...mesh import silence_vtk
 from ..grid import format_place
 
 # Diagonals of the bounding box: a limb and a bone from a file are larger; in inches or centimetres they are
@@ -35,12 +27,6 @@ from ..grid import format_place
 _SMALLEST_MM = {"skin": 60.0, "tibia": 30.0, "fibula": 30.0, "femur": 30.0}
 _SMALLEST_OTHER_MM = 15.0
 _LARGEST_MM = 3000.0
-SUFFIXES = (".stl", ".ply", ".vtp", ".obj")
-UNITS_MM: Mapping[str, float] = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "inch": 25.4}
-MAX_ITEMS = 50_000_000  # points or faces of a surface
-_BLOCK = 1 << 20
-_STATED = re.compile(rb"""NumberOf(?:Points|Polys|Strips|Lines|Verts|Tuples)\s*=\s*["'](\d+)["']""")
-_HEAD = 4096  # bytes in which a file may state its space
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,6 +186,13 @@ def remove_unused_points(surface: Surface) -> Surface:
     return Surface(surface.points[used], inverse.reshape(surface.faces.shape))
 
 
+def stack_surfaces(parts: Sequence[Surface]) -> Surface:
+    """Surfaces side by side in one."""
+    starts = np.cumsum([0, *(len(part.points) for part in parts)])
+    faces = [part.faces + start for part, start in zip(parts, starts)]
+    return Surface(np.concatenate([part.points for part in parts]), np.concatenate(faces))
+
+
 def find_bodies(surface: Surface) -> list[Surface]:
     """The connected bodies of a surface, the one with most faces first."""
     pieces = number_components(find_half_edges(surface.faces), len(surface.points))
@@ -219,6 +212,38 @@ def find_open_edges(faces: Indices) -> Indices:
     edges = find_half_edges(faces)
     _, inverse, counts = np.unique(np.sort(edges, axis=1), axis=0, return_inverse=True, return_counts=True)
     return edges[counts[inverse.ravel()] == 1]
+
+
+def open_loops(surface: Surface) -> list[Indices]:
+    """Points of each loop in the order of its faces' edges; loops that touch in a point are taken apart."""
+    following: dict[int, list[int]] = {}
+    for start, end in find_open_edges(surface.faces).tolist():
+        following.setdefault(start, []).append(end)
+    loops = []
+    while following:
+        way = [next(iter(following))]
+        while following.get(way[-1]):
+            here = following[way[-1]].pop()
+            if not following[way[-1]]:
+                del following[way[-1]]
+            if here in way:
+                at = way.index(here)
+                loops.append(np.array(way[at:]))
+                way = way[: at + 1]
+            else:
+                way.append(here)
+        following.pop(way[-1], None)
+    return loops
+
+
+def close_by_fans(surface: Surface) -> Surface:
+    """An open surface with each of its openings closed by a fan around the opening's middle."""
+    points, faces = [surface.points], [surface.faces]
+    for count, loop in enumerate(open_loops(surface)):
+        middle = np.full(len(loop), len(surface.points) + count)
+        points.append(surface.points[loop].mean(axis=0)[None])
+        faces.append(np.column_stack([np.roll(loop, -1), loop, middle]))
+    return Surface(np.vstack(points), np.vstack(faces))
 
 
 def has_turned_faces(faces: Indices) -> bool:
@@ -311,124 +336,3 @@ def check_sides(surface: Surface, name: str) -> None:
             f"{name}: neighbouring faces are oriented against each other",
             remedy="orient the normals consistently outward",
         )
-
-
-def read_surface(
-    path: str | Path,
-    coordinates: Literal["LPS", "RAS"] | None = None,
-    unit: str = "mm",
-    *,
-    key: str = "surfaces.coordinates",
-    merge: bool = True,
-) -> Surface:
-    """A surface from .stl, .ply, .vtp or .obj, in LPS mm; coincident points are merged.
-
-    Raises `SurfaceError` for a file that cannot be read, holds no triangles, or says that it is in other
-    coordinates. Closedness and size are for :func:`~limbfit.anatomy.surfaces.triangles.check_closed`.
-
-    Parameters
-    ----------
-    coordinates : what the file holds; by default what it says itself, as those of 3D Slicer do, else LPS.
-    unit : of the file: mm, cm, m or inch.
-    key : of the study that says the coordinates, for the error's text.
-    merge : False keeps points and triangles as the file has them.
-    """
-    path = Path(path)
-    with add_location(file=path):
-        if not path.is_file():
-            raise SurfaceError("no such surface")
-        _check_suffix(path)
-        poly = _read_poly(path, merge)
-        surface = from_pyvista(poly.triangulate())
-        if not np.all(np.isfinite(surface.points)):
-            raise SurfaceError("points that are not numbers", remedy="export the surface again")
-        stated = _read_stated_space(path, poly)
-        if coordinates and stated and coordinates != stated:
-            raise SurfaceError(
-                f"the file says that it is in {stated}, the study says {coordinates}",
-                remedy=f"correct {key}, or export the surface again",
-            )
-        sign = np.array([-1.0, -1.0, 1.0]) if (coordinates or stated) == "RAS" else np.ones(3)
-        merged = Surface(surface.points * sign * UNITS_MM[unit], surface.faces)
-        if merge:
-            merged = _merge_points(merged)
-        if not len(merged.faces):
-            raise SurfaceError("the file holds no triangles", remedy="export the surface again")
-        return merged
-
-
-def _read_stated_space(path: Path, poly: pv.PolyData) -> str | None:
-    """``LPS`` or ``RAS`` where the file says so as 3D Slicer does: SPACE in its header or field data."""
-    if "SPACE" in poly.field_data:
-        text = str(poly.field_data["SPACE"][0])
-        return text if text in ("LPS", "RAS") else None
-    with path.open("rb") as stream:
-        found = re.search(rb"SPACE=(LPS|RAS)", stream.read(_HEAD))
-    return found[1].decode() if found else None
-
-
-def _check_suffix(path: Path) -> None:
-    if path.suffix.lower() not in SUFFIXES:
-        raise SurfaceError(
-            f"unknown kind of surface {path.suffix!r}", remedy="use one of " + " ".join(SUFFIXES)
-        )
-
-
-def _read_poly(path: Path, merge: bool) -> pv.PolyData:
-    if path.suffix.lower() == ".vtp":
-        _check_stated_counts(path)
-    try:
-        with silence_vtk(), warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            if path.suffix.lower() == ".ply":
-                poly = _read_ply(path)
-            else:
-                reader = pv.get_reader(str(path))
-                if isinstance(reader, pv.STLReader):
-                    reader.reader.SetMerging(merge)
-                poly = reader.read()
-    except Exception:  # readers raise many kinds; all mean the same to the user
-        raise SurfaceError("the surface cannot be read", remedy="export the surface again") from None
-    if not isinstance(poly, pv.PolyData):
-        raise SurfaceError("the file holds no triangles", remedy="export the surface again")
-    corners = vtk_to_numpy(poly.GetPolys().GetConnectivityArray())
-    if len(corners) and not 0 <= corners.min() <= corners.max() < poly.n_points:  # VTK would take any memory
-        raise SurfaceError("faces of points that are not there", remedy="export the surface again")
-    return poly
-
-
-def _check_stated_counts(path: Path) -> None:
-    """Refuse a VTK XML file that states more than `MAX_ITEMS` points, faces or values of an array."""
-    rest = b""
-    with path.open("rb") as stream:
-        while block := stream.read(_BLOCK):
-            text = rest + block
-            if any(int(match[1][:20]) > MAX_ITEMS for match in _STATED.finditer(text)):
-                raise SurfaceError(
-                    f"it states more than {MAX_ITEMS:.0e} points or faces",
-                    remedy="export the surface again, with fewer triangles",
-                )
-            rest = text[-64:]
-
-
-def _read_ply(path: Path) -> pv.PolyData:
-    """By meshio: VTK's reader takes the whole process down with it when the file is cut short."""
-    found = meshio.ply.read(path)  # meshio.read would print what is wrong, and end the process
-    faces = [np.insert(block.data, 0, block.data.shape[1], axis=1).ravel() for block in found.cells]
-    return pv.PolyData(found.points.astype(float), np.concatenate(faces))
-
-
-def _merge_points(surface: Surface) -> Surface:
-    """Merge points that coincide exactly (STL repeats them), and drop faces that collapse."""
-    points, inverse = np.unique(surface.points, axis=0, return_inverse=True)
-    faces = inverse.ravel()[surface.faces]
-    a, b, c = faces.T
-    return remove_unused_points(Surface(points, faces[(a != b) & (b != c) & (c != a)]))
-
-
-def write_surface(path: str | Path, surface: Surface) -> None:
-    """Write .stl (binary), .ply, .vtp or .obj by the suffix, in LPS mm."""
-    path = Path(path)
-    with silence_vtk(), add_location(file=path):
-        _check_suffix(path)
-        surface.to_pyvista().save(str(path), recompute_normals=False)

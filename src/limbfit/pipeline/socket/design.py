@@ -35,6 +35,7 @@ from ..engine.digests import code_digest, compute_digest
 from ..engine.store import RUNS, Made, ResultFiles, write_result, write_table
 from ..simulation.limb_geometry import LimbGeometry
 from . import shape
+from .fabrication import write_shop_package
 from .simulation import SocketLimb, SocketRun, run_sockets, simulate_socket
 
 NAME, PLACE = "socket_design", "socket.design"
@@ -125,6 +126,7 @@ def run_socket_design(
             "median_mm": np.median(thickness),
             "volume_cm3": walled.volume / 1000.0,
         },
+        "shop": write_shop_package(folder, limb, last.face, walled),
         "parameters": parameters,
         "parameters_from": parameters_from,
         "liner": limb.liner,
