@@ -114,9 +114,9 @@ from .population.trials import (
     run_population as run_population,
     write_trial as write_trial,
 )
-from .results.reference import build_schema as build_schema
 from .results.study_results import (
     StudyResults as StudyResults,
+    build_schema as build_schema,
     load_results as load_results,
 )
 from .shapes import (

@@ -2,7 +2,7 @@
 
 from functools import cached_property
 from pathlib import Path
-from typing import Protocol, TypeVar
+from typing import Any, Protocol, TypeVar
 
 from ..arrays import Array
 from ..errors import InputError
@@ -11,6 +11,7 @@ from .base import StoredResult, read_curves
 from .identification import CalibrationResult, PredictResult
 from .limb import MeshResult, QualityResult, SegmentResult, SitesResult, SurfacesResult, TracesResult
 from .planning import DesignResult, ProtocolResult
+from .population import PopulationResult
 from .runs import CompareResult, RunResult, SimulateResult, StageStamp
 from .socket import SocketDesignResult, SocketResult
 from .uncertainty import CrossvalidateResult, ModelsResult, RegionsResult, SocketOfModels, UncertaintyResult
@@ -111,3 +112,13 @@ def load_results(study: HasResults | str | Path) -> StudyResults:
     if not folder.is_dir():
         raise InputError("nothing is stored there", file=folder, remedy="run limbfit run first")
     return StudyResults(folder)
+
+
+ALL_MODELS = MODELS | {"population": PopulationResult}
+
+
+def build_schema(result: str) -> dict[str, Any]:
+    """Build the JSON schema of a stored result. Raises `InputError` for a name that no result has."""
+    if result not in ALL_MODELS:
+        raise InputError(f"no result is named {result!r}", remedy=f"use {', '.join(ALL_MODELS)}")
+    return ALL_MODELS[result].model_json_schema()

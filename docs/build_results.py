@@ -1,23 +1,20 @@
-"""The stored results as a page of Markdown (docs/results.md), and as JSON schemas."""
+"""The stored results with their keys as a page of Markdown (docs/results.md)."""
 
 import sys
 import types
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Union, get_args, get_origin
 
-from ..errors import InputError
-from .base import ResultPart
-from .population import PopulationResult
-from .study_results import MODELS as OF_STUDIES
+from limbfit.results.base import ResultPart
+from limbfit.results.study_results import ALL_MODELS
 
 HEAD = """# Results
 
-Made by `python -m limbfit.results.reference`. Every result of a study is a JSON file below `results`.
+Made by `python docs/build_results.py`. Every result of a study is a JSON file below `results`.
 In Python it is an attribute of [`load_results(study)`](python.md#stored-results) with the same keys, and
 `limbfit schema RESULT` prints its JSON schema. Numbers are in the unit of their row. Curves and tables
 are CSV files beside these.
 """
-MODELS = OF_STUDIES | {"population": PopulationResult}
 _UNITS = ("mm", "mm2", "mm3", "cm3", "N", "Nmm", "kPa", "s", "m_s", "mm_s", "deg", "percent", "GB")
 _UNIT_WORDS = {"mm2": "mm²", "mm3": "mm³", "cm3": "cm³", "Nmm": "N mm", "m_s": "m/s", "mm_s": "mm/s"}
 _WORDS: Mapping[Any, str] = {
@@ -30,17 +27,10 @@ _WORDS: Mapping[Any, str] = {
 }
 
 
-def build_schema(result: str) -> dict[str, Any]:
-    """Build the JSON schema of a stored result. Raises `InputError` for a name that no result has."""
-    if result not in MODELS:
-        raise InputError(f"no result is named {result!r}", remedy=f"use {', '.join(MODELS)}")
-    return MODELS[result].model_json_schema()
-
-
 def build_results_page() -> str:
     """All results with their keys, as Markdown."""
     parts, described = [HEAD], set[type[ResultPart]]()
-    for name, model in MODELS.items():
+    for name, model in ALL_MODELS.items():
         parts.append(f"## {name}\n")
         parts.append(f"`{model.FILE.replace('*', '<name>')}`, by `{model.COMMAND}`. {_describe(model)}\n")
         for part in _list_parts(model):
