@@ -102,5 +102,5 @@ def test_a_changed_file_changes_what_it_decides_and_nothing_else(tmp_path):
 
     assert changed_by("report/templates/report.css", "/* */\n") == {"report", "cube"}
     meshed = changed_by("anatomy/meshing/improving.py", "\n# a remark\n")
-    assert "mesh" in meshed
-    assert not meshed & {"segment", "surfaces", "sites", "traces", "calibrate", "predict", "report"}
+    assert meshed >= {"mesh", "calibrate"}  # a calibration corrects its answer by coarser meshes of its own
+    assert not meshed & {"segment", "surfaces", "sites", "traces", "predict", "report"}
