@@ -1,7 +1,6 @@
 """Which stages there are, what each depends on, and runs of one study or many that do what is missing."""
 
 import json
-import shutil
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
@@ -10,11 +9,9 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any
 
-from ... import report
 from ..._version import __version__
 from ...errors import InputError, LimbfitError, RunError
 from ...execution import make_executor, run_in_background, share_executor
-from ...extensions import load_extensions
 from ...fe import are_compiled, compile_kernels
 from ...results.identification import CalibrationResult, PredictResult
 from ...results.runs import ExperimentRecord, MachineFacts, RunResult, StageRecord, StudyName
@@ -45,25 +42,7 @@ from ..records.secondary_measurements import read_motion
 from ..records.traces import run_traces
 from ..simulation.limb_geometry import LimbGeometry
 from .experiments import EXPERIMENTS, check_experiment, compute_experiment_key, list_experiment_states
-
-
-def run_report(context: Context, folder: Path) -> None:
-    """``report.html``; a phantom's ``truth.json`` beside the study is shown in it.
-
-    It is drawn on the executor: graphics libraries can crash, and a worker that dies is an error in words.
-    """
-    context.tell("report", 0, 1, "drawing figures")
-    truth = context.study.folder / "truth.json"
-    if truth.is_file():
-        shutil.copyfile(truth, context.store.folder / "truth.json")
-    list(context.executor.map(_draw, [(context.store.folder, folder, context.study.extensions)]))
-
-
-def _draw(job: tuple[Path, Path, tuple[Path, ...]]) -> None:
-    results, out, extensions = job
-    load_extensions(extensions)  # they may have sections and words of their own
-    report.build_report(results, out)
-
+from .report import run_report
 
 _PLACE = ("name", "position", "near", "axis", "edge", "region", "fitted", "indenter")
 _WAVES = ("shear_waves", "shear_waves_sd_m_s", "shear_waves_bias_m_s")
