@@ -25,6 +25,7 @@ from limbfit.errors import LabelError, MeshingError, SurfaceError
 from limbfit.mesh import Mesh, boundary_faces
 
 COARSE = MeshSettings(edge_near_mm=6.0, edge_far_mm=24.0, near_radius_mm=10.0, growth=0.9)
+FINE = replace(COARSE, edge_far_mm=15.0, growth=0.6)  # volumes of regions within some percent
 CUT = np.array([12.0, -80.0, 300.0])  # the middle of the limb's proximal cut, LPS mm
 
 
@@ -49,6 +50,7 @@ def limb_without() -> Anatomy:
 
 
 INSIDE = ([-14.0, 0.0, -40.0], [5.0, 8.0, 11.0])
+LONG = ([-14.0, 0.0, -40.0], [5.0, 9.0, 16.0])
 THROUGH = ([23.0, 0.0, -40.0], [8.0, 8.0, 11.0])  # the sheet of muscle between bone and layer
 
 
@@ -113,8 +115,8 @@ def test_a_gap_thinner_than_the_clearance_is_closed() -> None:
 
 @pytest.mark.slow
 def test_two_that_overlap_share_one_face() -> None:
-    anatomy = with_regions(first=INSIDE, second=([-14.0, 14.0, -40.0], [6.0, 9.0, 16.0]))
-    mesh, report = mesh_site(anatomy, *SITE, COARSE)
+    anatomy = with_regions(first=LONG, second=([-14.0, 14.0, -40.0], [6.0, 9.0, 16.0]))
+    mesh, report = mesh_site(anatomy, *SITE, FINE)
     assert mesh.region_names == ("skin", "first", "second", "muscle")
     assert report.region_volumes_mm3["first"] == pytest.approx(anatomy.regions["first"].volume, rel=0.04)
     assert report.region_volumes_mm3["second"] < 0.98 * anatomy.regions["second"].volume
@@ -125,7 +127,7 @@ def test_two_that_overlap_share_one_face() -> None:
 
 @pytest.mark.slow
 def test_the_mesh_of_a_whole_limb_has_it_too() -> None:
-    mesh, report = mesh_limb(with_regions(scar=INSIDE), replace(COARSE, edge_near_mm=8.0), 30.0)
+    mesh, report = mesh_limb(with_regions(scar=INSIDE), replace(FINE, edge_near_mm=8.0), 30.0)
     assert mesh.region_names == ("skin", "scar", "muscle")
     assert report.region_volumes_mm3["scar"] == pytest.approx(report.regions["scar"].enclosed_mm3, rel=0.05)
 

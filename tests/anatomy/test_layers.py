@@ -57,7 +57,8 @@ def test_steps_follow_the_thickness_and_change_by_one_at_most() -> None:
 def test_three_layers_are_as_thick_as_asked() -> None:
     anatomy = limb()
     position, axis = site_of(anatomy, np.array([0, 1.0, 0]), -35.0)
-    mesh, report = mesh_site(anatomy, position, axis, replace(COARSE, edge_near_mm=3.5, layers=THREE))
+    settings = replace(COARSE, edge_near_mm=3.5, edge_far_mm=15.0, growth=0.6, layers=THREE)
+    mesh, report = mesh_site(anatomy, position, axis, settings)
     assert mesh.region_names == ("skin", "fat", "muscle")
     assert np.unique(mesh.regions).tolist() == [0, 1, 2]
     conforms(mesh)
