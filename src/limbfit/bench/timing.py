@@ -17,7 +17,7 @@ import numpy as np
 
 from ..errors import InputError, ProblemError, RunError
 from ..execution import ProcessExecutor
-from ..fe import ELEMENTS, History, Indenter, OgdenQLV, Problem, StepControl, solve
+from ..fe import ELEMENTS, History, Indenter, OgdenQLV, Problem, Result, StepControl, solve
 from ..febio import find_febio, read_log, run_feb, run_febio
 from ..indentation import SiteModel
 from ..mesh import Mesh, to_tet10
@@ -122,18 +122,7 @@ def solve_input_timed(threads: int, file: Path) -> dict[str, Any]:
     with tempfile.TemporaryDirectory(prefix="limbfit-bench-") as out:
         run_feb(file, out, times=(0.01,), threads=threads)  # compiles by one small step
         result = run_feb(file, out, threads=threads).result
-    seconds = dict(result.statistics["seconds"])
-    return {
-        **{
-            key: result.statistics[key]
-            for key in ("unknowns", "steps", "newton_iterations", "factorisations")
-        },
-        "seconds": seconds.pop("total"),
-        "max_rss_MB": measure_max_rss_MB(),
-        "seconds_by_part": seconds,
-        "completed": result.completed,
-        "reason": result.reason,
-    }
+    return describe_result(result)
 
 
 def time_febio(program: Path, folder: Path, case: str, threads: int) -> float:
@@ -207,13 +196,16 @@ def solve_timed(problem: Problem, control: StepControl, sensitivities: bool) -> 
     """Sizes, seconds by part with warm kernels, largest memory of this process, and how far it came."""
     warm_up(problem.formulation.name, sensitivities)
     result = solve(problem, control, sensitivities, store="none")
-    statistics = dict(result.statistics)
-    seconds = dict(statistics.pop("seconds"))
+    return describe_result(result) | {"peak_force_N": float(np.max(result.force))}
+
+
+def describe_result(result: Result) -> dict[str, Any]:
+    """Sizes, seconds by part, largest memory of this process, and how far a simulation came."""
+    seconds = dict(result.statistics["seconds"])
+    kept = ("unknowns", "element", "steps", "newton_iterations", "factorisations", "linear_solver")
     return {
-        **{key: statistics[key] for key in ("unknowns", "element", "steps", "newton_iterations")},
-        **{key: statistics[key] for key in ("factorisations", "linear_solver")},
+        **{key: result.statistics[key] for key in kept},
         "seconds": seconds.pop("total"),
-        "peak_force_N": float(np.max(result.force)),
         "max_rss_MB": measure_max_rss_MB(),
         "seconds_by_part": seconds,
         "completed": result.completed,

@@ -98,6 +98,7 @@ class StudyResults:
 MODELS: dict[str, type[StoredResult]] = {  # of each stored result, by its attribute
     name: kind.model for name, kind in vars(StudyResults).items() if isinstance(kind, OneFile | ManyFiles)
 }
+ALL_MODELS = MODELS | {"population": PopulationResult}
 
 
 def load_results(study: HasResults | str | Path) -> StudyResults:
@@ -112,9 +113,6 @@ def load_results(study: HasResults | str | Path) -> StudyResults:
     if not folder.is_dir():
         raise InputError("nothing is stored there", file=folder, remedy="run limbfit run first")
     return StudyResults(folder)
-
-
-ALL_MODELS = MODELS | {"population": PopulationResult}
 
 
 def build_schema(result: str) -> dict[str, Any]:

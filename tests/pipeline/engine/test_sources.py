@@ -100,7 +100,7 @@ def test_a_changed_file_changes_what_it_decides_and_nothing_else(tmp_path):
             stream.write(line)
         return {stage for stage, value in digests().items() if value != before[stage]}
 
-    assert changed_by("report/templates/report.css", "/* */\n") == {"report", "cube", "socket_design"}
+    assert changed_by("report/templates/report.css", "/* */\n") == {"report", "cube"}
     meshed = changed_by("anatomy/meshing/improving.py", "\n# a remark\n")
     assert meshed >= {"mesh", "calibrate"}  # a calibration corrects its answer by coarser meshes of its own
     assert not meshed & {"segment", "surfaces", "sites", "traces", "predict", "report"}

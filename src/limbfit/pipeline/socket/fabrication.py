@@ -3,13 +3,13 @@
 from pathlib import Path
 
 import numpy as np
+from jinja2 import StrictUndefined, Template
 
 from ...anatomy.surfaces.comparison import list_circumferences
 from ...anatomy.surfaces.files import write_surface
 from ...anatomy.surfaces.slices import format_slices
 from ...anatomy.surfaces.triangles import Surface
 from ...errors import InputError
-from ...report.words import make_environment
 from ...results.shapes import ShopPackage
 from ...socket import Socket
 from ..engine.store import write_table
@@ -17,6 +17,7 @@ from .shape import find_covered_regions
 from .simulation import SocketLimb
 
 FOLDER, SHEET = "shop", "check-sheet.html"
+TEMPLATE = Path(__file__).parent / "check-sheet.html.j2"
 
 
 def write_shop_package(folder: Path, limb: SocketLimb, face: Socket, wall: Surface) -> ShopPackage:
@@ -37,8 +38,8 @@ def write_shop_package(folder: Path, limb: SocketLimb, face: Socket, wall: Surfa
     except InputError as error:
         left_out.append(str(error))
     try:
-        text, deviation = format_slices(outside, axis, (limb.study.socket.side or "none").upper())
-        (shop / "shape.aop").write_text(text, encoding="ascii")
+        slices, deviation = format_slices(outside, axis, (limb.study.socket.side or "none").upper())
+        (shop / "shape.aop").write_text(slices, encoding="ascii")
         files["shape.aop"] = "the shape inside, as slices; above the trim line it goes on straight"
     except InputError as error:
         left_out.append(f"shape.aop: {error}")
@@ -54,6 +55,8 @@ def write_shop_package(folder: Path, limb: SocketLimb, face: Socket, wall: Surfa
         circumferences=list_circumferences(limb.outer.skin, outside, axis),
         depths_mm={name: (at[mask].mean(), at[mask].min(), at[mask].max()) for name, mask in covered.items()},
     )
-    sheet = make_environment(autoescape=True).get_template("shop.html.j2")
-    (shop / SHEET).write_text(sheet.render(package=package, axis=axis, wall=limb.study.socket.design.wall_mm))
+    text = TEMPLATE.read_text(encoding="utf-8")
+    sheet = Template(text, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    content = sheet.render(package=package, axis=axis, wall=limb.study.socket.design.wall_mm)
+    (shop / SHEET).write_text(content, encoding="utf-8")
     return package

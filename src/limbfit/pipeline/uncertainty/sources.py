@@ -71,13 +71,13 @@ def simulate_sources(
     models = [_hold_penalty(job.model, answer) for job, answer in zip(plain, answers, strict=True)]
     variants = _build_variants(context, folder, records, plain, models)
     jobs = [job for variant in variants for job in variant.jobs]
+    total = len(plain) + len(jobs)
     forces: list[Array | None] = []
     for record, simulation in zip(cycle(records.own), chain(answers, cache.run(jobs, context.executor))):
         answer = simulation.force_N if record.seen is None else record.respond(simulation).force_N
         forces.append(answer if simulation.completed else None)
-        total = len(plain) + len(jobs)
         context.tell("uncertainty", len(forces), total, f"sources, site {simulation.site}")
-    before, *rows = (forces[i : i + len(plain)] for i in range(0, len(forces), len(plain)))
+    before, *rows = (forces[i : i + len(plain)] for i in range(0, total, len(plain)))
     found = []
     for variant, after in zip(variants, rows, strict=True):
         differences, failed = [], []
