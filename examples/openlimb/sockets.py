@@ -14,10 +14,9 @@ import sys
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from limbfit.anatomy.surfaces.mending import open_loops
-from limbfit.anatomy.surfaces.surfaces import Surface, find_bodies, read_surface, write_surface
+from limbfit.anatomy.surfaces.bodies import name_bodies
+from limbfit.anatomy.surfaces.files import read_surface, write_surface
+from limbfit.anatomy.surfaces.triangles import Surface, remove_unused_points
 
 PROMINENCES = ("tibial crest", "fibular head", "distal tibia")
 CASES = {
@@ -59,20 +58,10 @@ pressure = "{pressure}"
 EDGE_MM = 16.0
 
 
-def named_bodies(file: Path) -> dict[str, Surface]:
-    """The five bodies: the skin is the largest, the femur open, the patella the highest, the fibula thin."""
-    parts = [part for part in find_bodies(read_surface(file)) if len(part.faces) > 100]
-    parts.sort(key=lambda part: -float(np.prod(np.ptp(part.points, axis=0))))
-    skin, *bones = parts
-    femur = next(bone for bone in bones if len(open_loops(bone)))
-    closed = [bone for bone in bones if bone is not femur]
-    patella = max(closed, key=lambda bone: bone.points[:, 2].mean())
-    tibia, fibula = (bone for bone in closed if bone is not patella)
-    return {"skin": skin, "femur": femur, "patella": patella, "tibia": tibia, "fibula": fibula}
-
-
 def prepare(file: Path, folder: Path) -> None:
-    parts = named_bodies(file)
+    whole = read_surface(file)
+    named = name_bodies(whole, file)
+    parts = {name: remove_unused_points(Surface(whole.points, faces)) for name, faces in named.items()}
     skin = parts["skin"].points
     site = ", ".join(f"{x:.2f}" for x in skin[skin[:, 2].argmin()])
     for name, (pressure, liner) in CASES.items():
