@@ -1,6 +1,5 @@
 """The commands of the socket: its load on the limb, and its design."""
 
-from collections import Counter
 from collections.abc import Mapping
 from typing import Annotated, Any
 
@@ -103,9 +102,7 @@ def show_socket(found: SocketResult) -> None:
         print_line(f"95 %: with what relaxation may do until the socket has been worn for {found.worn_s:g} s")
     for row in (row for row in found.agreement if row.region == "all"):
         limits = f" (95 % limits of agreement {format_ends(row.limits_kPa, '.1f')})" if row.limits_kPa else ""
-        counts = sum((Counter(one.counts) for one in found.sensors if one.load == row.load), Counter())
-        others = "".join(f"; {counts[state]} {state}" for state in sorted(counts) if state != "compared")
-        inside = f"{row.within_percent:.0f} % of {row.cells} cells within error and interval{others}"
+        inside = f"{row.within_percent:.0f} % of {row.cells} cells within error and interval"
         print_line(f"{row.load}: model minus measured {row.bias_kPa:.1f} kPa{limits}; {inside}")
     balance = f"contact balances the loads within {found.balance_percent:.2g} %"
     print_line(f"tissues: {found.parameters_from}; {balance}; not a medical device")

@@ -339,13 +339,19 @@ def _truth_to_dict(patient: _Patient) -> dict[str, Any]:
     }
 
 
-def _format_study(patient: _Patient) -> str:
-    """The content of ``study.toml`` for the indented sites, as a user would write it."""
+def render_template(name: str, **facts: Any) -> str:
+    """Render a file of the phantom by its template."""
     loader = PackageLoader("limbfit.phantom", "templates")
     environment = Environment(
         loader=loader, undefined=StrictUndefined, trim_blocks=True, keep_trailing_newline=True
     )
-    return environment.get_template("study.toml.j2").render(
+    return environment.get_template(name).render(facts)
+
+
+def _format_study(patient: _Patient) -> str:
+    """The content of ``study.toml`` for the indented sites, as a user would write it."""
+    return render_template(
+        "study.toml.j2",
         sites=patient.indented,
         detail=patient.detail,
         seed=patient.seed,

@@ -8,7 +8,6 @@ line for each frame. Both are read as the example files of the R package pressuR
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from itertools import takewhile
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -16,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.ndimage import convolve
 
-from ..arrays import Array, Indices, Mask
+from ..arrays import Array, Indices
 from ..errors import InputError, add_location
 
 COLUMNS = ("x_mm", "y_mm", "z_mm", "area_mm2", "pressure_kPa")
@@ -62,7 +61,7 @@ class SensorFrames:
         cells = np.arange(len(self.area_mm2))[:, None] if self.place is None else self.place
         return ["-".join(map(str, cell)) for cell in (cells + 1).tolist()]
 
-    @cached_property
+    @property
     def frames(self) -> Array:
         """Pressure (k, n) kPa of the frames that count."""
         return self.pressure_kPa[(self.time_s >= self.start_s) & (self.time_s <= self.end_s)]
@@ -73,19 +72,15 @@ class SensorFrames:
         mean = self.frames.mean(axis=0)
         states = np.where(mean < BELOW_SHARE * self.noise_kPa, BELOW, COMPARED).astype(object)
         states[(self.frames >= self.saturation_kPa).any(axis=0)] = SATURATED
-        states[np.isnan(mean) | self._find_silent(mean)] = DEAD
+        if self.place is not None and self.layout is not None:
+            at, maps = tuple(self.place.T), np.zeros((2, *self.layout.shape))
+            maps[0][at], maps[1][at] = 1.0, mean > self.noise_kPa
+            ring = np.where(np.arange(9).reshape(3, 3) == 4, 0.0, 1.0)
+            neighbours, pressed = (convolve(one, ring, mode="constant")[at] for one in maps)
+            is_alone = (neighbours > 2.0) & (pressed >= DEAD_SHARE * neighbours)
+            states[is_alone & ~(self.pressure_kPa > 0.0).any(axis=0)] = DEAD
+        states[np.isnan(mean)] = DEAD
         return [str(state) for state in states]
-
-    def _find_silent(self, mean: Array) -> Mask:
-        """Cells (n,) of a sheet that never read anything while most of their neighbours do."""
-        silent = ~(self.pressure_kPa > 0.0).any(axis=0)
-        if self.place is None or self.layout is None:
-            return np.zeros_like(silent)
-        at, maps = tuple(self.place.T), np.zeros((2, *self.layout.shape))
-        maps[0][at], maps[1][at] = 1.0, mean > self.noise_kPa
-        ring = np.where(np.arange(9).reshape(3, 3) == 4, 0.0, 1.0)
-        neighbours, pressed = (convolve(one, ring, mode="constant")[at] for one in maps)
-        return np.asarray(silent & (neighbours > 2.0) & (pressed >= DEAD_SHARE * neighbours))
 
 
 def read_recording(file: Path, layout: SheetLayout | None, kind: str, **stated: Any) -> SensorFrames:

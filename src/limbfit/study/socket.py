@@ -21,13 +21,9 @@ LINERS: dict[str, dict[str, float]] = {
 
 
 # Names that results have for something else.
-TAKEN_NAMES = {
-    "areas": set[str](),
-    "loads": {"donning"},
-    "regions": {"the limb", "settling"},
-    "measured": set[str](),
-}
-# Keys of `MeasuredTable` that a format must have, and those that it cannot have.
+TAKEN_NAMES = {"areas": set[str](), "loads": {"donning"}, "regions": {"the limb", "settling"}}
+TAKEN_NAMES |= {"measured": set()}
+# Keys of `MeasuredTable` for sheets, and for those whose file does not state their layout.
 SHEET_KEYS, LAYOUT_KEYS = ("landmarks", "markups", "from_s", "to_s"), ("rows", "columns", "spacing_mm")
 
 
@@ -161,8 +157,6 @@ class MeasuredTable(TomlTable):
             raise ValueError(f"the file does not state the sheet's layout; give {missing[0]}")
         if not self.error_kPa + self.error_percent:
             raise ValueError("the sensor's error is not known; give error_kPa, error_percent or both")
-        if self.from_s is not None and self.to_s is not None and self.from_s >= self.to_s:
-            raise ValueError("from_s must come before to_s")
         if (self.markups is None) == any(one.marker is not None for one in self.landmarks):
             raise ValueError("markups and the landmarks' marker belong together; give both or neither")
         if is_sheet and len(self.landmarks) < 3:

@@ -208,9 +208,7 @@ def _describe_outside(
 
 
 def _describe_surface_motion(
-    study: Study,
-    motions: Mapping[str, SurfaceMotion | None],
-    limb: LimbGeometry | None,
+    study: Study, motions: Mapping[str, SurfaceMotion | None], limb: LimbGeometry | None
 ) -> Iterator[str]:
     """How the skin around the indenter moves, and which of its points are compared where sites are known."""
     chosen = {} if limb is None else choose_surface_points(limb, study, motions)

@@ -121,36 +121,29 @@ def compare_measured(
         model, faces = sample_pressure(run, found.held[table.load], recording.position, recording.area_mm2)
         mean = recording.frames.mean(axis=0)
         rows = {row["region"]: row for row in held[table.load]["regions"]}
-        error = np.hypot(table.error_kPa, 0.01 * table.error_percent * np.nan_to_num(mean))
-        level, angle = axis.measure_level(recording.position), axis.measure_angle(recording.position)
-        cells = []
-        for i, name in enumerate(recording.names):
-            regions = sorted((one for one in sizes if run.faces[one][faces[i]]), key=sizes.__getitem__)
-            cell = MeasuredCell(
-                cell=name,
-                state=states[i],
-                regions=regions,
-                position_mm=tuple(recording.position[i]),
-                level_mm=level[i],
-                angle_deg=angle[i],
-                measured_kPa=mean[i] if np.isfinite(mean[i]) else None,
-                error_kPa=error[i],
-                model_kPa=model[i],
-                interval_kPa=_scale_interval(float(model[i]), [rows[one] for one in regions]),
-            )
-            cells.append(cell)
-        named = {"name": table.name, "load": table.load, "counts": Counter(states), "cells": cells}
-        sensors.append(SensorComparison.model_validate({**named, "stretch_percent": stretch}))
+        around = [sorted((n for n in sizes if run.faces[n][face]), key=sizes.__getitem__) for face in faces]
+        columns = {
+            "cell": recording.names,
+            "state": states,
+            "regions": around,
+            "position_mm": recording.position,
+            "level_mm": axis.measure_level(recording.position),
+            "angle_deg": axis.measure_angle(recording.position),
+            "measured_kPa": [value if np.isfinite(value) else None for value in mean.tolist()],
+            "error_kPa": np.hypot(table.error_kPa, 0.01 * table.error_percent * np.nan_to_num(mean)),
+            "model_kPa": model,
+            "interval_kPa": [_scale_interval(p, [rows[n] for n in names]) for p, names in zip(model, around)],
+        }
+        named = {"name": table.name, "load": table.load, "stretch_percent": stretch}
+        cells = [dict(zip(columns, values)) for values in zip(*columns.values(), strict=True)]
+        sensors.append(SensorComparison.model_validate({**named, "counts": Counter(states), "cells": cells}))
     return sensors, summarise_agreement(sensors)
 
 
-def _scale_interval(value: float, rows: Sequence[Mapping[str, Any]]) -> tuple[float, float] | None:
+def _scale_interval(value: float, rows: Sequence[Mapping[str, Any]]) -> list[float] | None:
     """The interval of the first region that has one, in proportion to a value; None where none has."""
-    for row in rows:
-        if row["interval_kPa"] is not None and row["mean_kPa"] > 0.0:
-            low, high = row["interval_kPa"]
-            return value * low / row["mean_kPa"], value * high / row["mean_kPa"]
-    return None
+    known = (row for row in rows if row["interval_kPa"] is not None and row["mean_kPa"] > 0.0)
+    return next(([value * end / row["mean_kPa"] for end in row["interval_kPa"]] for row in known), None)
 
 
 def sample_pressure(
@@ -176,13 +169,12 @@ def sample_pressure(
 
 def summarise_agreement(sensors: Sequence[SensorComparison]) -> list[PressureAgreement]:
     """How model and measured pressures agree, by load and by region: all cells first, then each region."""
-    found = []
-    for load in dict.fromkeys(one.load for one in sensors):
-        cells = [cell for one in sensors if one.load == load for cell in one.cells if cell.state == COMPARED]
-        for region in (ALL, *sorted({name for cell in cells for name in cell.regions})):
-            inside = [cell for cell in cells if region == ALL or region in cell.regions]
-            found += [_compute_agreement(load, region, inside)] if inside else []
-    return found
+    inside: dict[tuple[str, str], list[MeasuredCell]] = {}
+    for one in sensors:
+        for cell in (cell for cell in one.cells if cell.state == COMPARED):
+            for region in (ALL, *cell.regions):
+                inside.setdefault((one.load, region), []).append(cell)
+    return [_compute_agreement(load, region, cells) for (load, region), cells in inside.items()]
 
 
 def _compute_agreement(load: str, region: str, cells: Sequence[MeasuredCell]) -> PressureAgreement:

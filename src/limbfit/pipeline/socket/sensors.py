@@ -1,4 +1,8 @@
-"""Sensors in a phantom's socket: a simulation with its true tissues and surfaces, on a mesh of its own."""
+"""Sensors in a phantom's socket: a simulation with its true tissues and surfaces, on a mesh of its own.
+
+Of an error e, within which 95 % of readings are stated to be, a cell's gain and each of its readings have a
+standard deviation of 0.3 e, and a drift of all cells grows to 0.3 e.
+"""
 
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -8,10 +12,11 @@ import numpy as np
 
 from ...anatomy.meshing.layers import build_liner_surface
 from ...anatomy.surfaces.surfaces import Anatomy
+from ...arrays import Array
 from ...indentation import Parameters
-from ...phantom.sensors import count_pressure, record_pressure, write_from_template
+from ...phantom.build import render_template
 from ...socket.rays import compute_profile
-from ...socket.sensors import SheetLayout
+from ...socket.sensors import FULL_SCALE, SheetLayout
 from ...socket.wrapping import wrap_sheet
 from ...study import load_study
 from .measured import sample_pressure
@@ -26,6 +31,20 @@ SENSORS: tuple[tuple[str, str, str, SheetLayout | None, str], ...] = (
 )
 CELL_MM2, ERROR_KPA, ERROR_PERCENT = 100.0, 2.0, 10.0
 FULL_SHARE, DEAD = 0.9, 20  # the sheet's saturation over its largest true pressure, and its dead cell
+SHARE, FRAMES, STEP_S, NOISE = 0.3, 20, 0.1, 3  # noise in counts of Tekscan's converter
+
+
+def record_pressure(true_kPa: Array, saturation_kPa: float, seed: int) -> Array:
+    """Readings (frames, n) kPa of true pressures (n,); with a saturation as Tekscan's converter counts."""
+    random, percent = np.random.default_rng([seed, 14]), 0.01 * ERROR_PERCENT * SHARE
+    gain = 1.0 + percent * random.standard_normal(len(true_kPa))
+    drift = 1.0 + percent * np.linspace(0.0, 1.0, FRAMES)
+    noise = ERROR_KPA * SHARE * random.standard_normal((FRAMES, len(true_kPa)))
+    frames = np.maximum(drift[:, None] * gain * true_kPa + noise, 0.0)
+    if np.isinf(saturation_kPa):
+        return np.asarray(frames)
+    counts = np.minimum(np.round(FULL_SCALE * frames / saturation_kPa), FULL_SCALE)
+    return np.where(counts < NOISE, 0.0, counts * saturation_kPa / FULL_SCALE)
 
 
 def write_true_sensors(folder: Path, anatomy: Anatomy, parameters: Parameters, seed: int) -> dict[str, Any]:
@@ -48,13 +67,7 @@ def write_true_sensors(folder: Path, anatomy: Anatomy, parameters: Parameters, s
     tables, truth = list[dict[str, Any]](), dict[str, list[float]]()
     (folder / "sensors").mkdir()
     for name, file, kind, layout, region in SENSORS:
-        table: dict[str, Any] = {
-            "name": name,
-            "file": file,
-            "format": kind,
-            "layout": layout,
-            "landmarks": [],
-        }
+        marks = list[tuple[int, int, Array]]()
         if layout is None:  # one over the middle of each region
             middles = np.array([one.position for one in limb.regions.values()])
             positions = socket.surface.find_nearest(middles[socket.find_covered(middles)])[2]
@@ -66,22 +79,20 @@ def write_true_sensors(folder: Path, anatomy: Anatomy, parameters: Parameters, s
             near = rays.points(angle + off[:, 1] / radius, station - off[:, 0], np.full(3, radius))
             grid, _ = wrap_sheet(layout, cells, frame.to_patient(near), socket, rays, frame)
             rows, columns = layout.shape
-            corners = ((1, 1), (1, columns), (rows, 1))
-            table["landmarks"] = [(i, j, grid[i - 1, j - 1]) for i, j in corners]
+            marks = [(i, j, grid[i - 1, j - 1]) for i, j in ((1, 1), (1, columns), (rows, 1))]
             positions = grid.reshape(-1, 3)
         true, _ = sample_pressure(run, held, positions, np.full(len(positions), area))
-        frames, full = record_pressure(true, ERROR_KPA, ERROR_PERCENT, seed + len(tables)), np.inf
+        full = FULL_SHARE * float(true.max()) if kind == "tekscan" else np.inf
+        frames = record_pressure(true, full, seed + len(tables))
         if kind == "tekscan":
-            full = FULL_SHARE * float(true.max())
-            frames = count_pressure(frames, full)
             frames[:, DEAD] = 0.0
-        facts = {"positions": positions, "area_mm2": area, "means": frames.mean(axis=0)}
-        template = f"{kind}{Path(file).suffix}.j2"
-        write_from_template(
-            folder / "sensors" / file, template, layout=layout, frames=frames, saturation_kPa=full, **facts
-        )
+        facts: dict[str, Any] = {"positions": positions, "area_mm2": area, "saturation_kPa": full}
+        facts |= {"frames": frames, "means": frames.mean(axis=0), "layout": layout}
+        text = render_template(f"{kind}{Path(file).suffix}.j2", step_s=STEP_S, noise=NOISE, **facts)
+        (folder / "sensors" / file).write_text(text, encoding="utf-8")
         truth[name] = true.tolist()
-        tables.append(table)
+        tables.append({"name": name, "file": file, "format": kind, "layout": layout, "landmarks": marks})
     errors = {"error_kPa": ERROR_KPA, "error_percent": ERROR_PERCENT}
-    write_from_template(study.file, "measured.toml.j2", "a", sensors=tables, load=load, **errors)
+    with study.file.open("a", encoding="utf-8") as stream:
+        stream.write(render_template("measured.toml.j2", sensors=tables, load=load, **errors))
     return truth

@@ -216,11 +216,3 @@ def _write_tables(folder: Path, result: SocketResult) -> None:
     heads = [*keys, *(f"force_{axis}_N" for axis in "xyz"), "settling_mm"]
     lines = [[*(getattr(row, key) for key in keys), *row.force_N, row.move_mm[2]] for row in result.steps]
     write_table(folder / "steps.csv", heads, lines)
-    heads = ["cell", "state", "level_mm", "angle_deg", "measured_kPa", "error_kPa", "model_kPa"]
-    cells = [
-        [one.name, one.load, *(getattr(cell, key) for key in heads), *cell.position_mm]
-        for one in result.sensors
-        for cell in one.cells
-    ]
-    if cells:
-        write_table(folder / "measured.csv", ["sensors", "load", *heads, "x_mm", "y_mm", "z_mm"], cells)
