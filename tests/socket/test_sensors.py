@@ -7,7 +7,7 @@ import pytest
 from socket_limbs import round_limb
 
 from limbfit.errors import InputError, SurfaceError
-from limbfit.phantom.build import render_template
+from limbfit.phantom.build import make_phantom, render_template
 from limbfit.pipeline.socket.sensors import record_pressure
 from limbfit.socket import Recipe, rectify_limb
 from limbfit.socket.rays import compute_profile
@@ -76,6 +76,11 @@ def test_a_broken_file_is_named_with_the_place_and_the_remedy(tmp_path, kind, te
     with pytest.raises(InputError, match=said) as caught:
         read(tmp_path, text.replace(old, new, 1), kind)
     assert str(caught.value).startswith(str(tmp_path / "file"))
+
+
+def test_a_phantom_without_a_socket_has_no_sensors(tmp_path):
+    with pytest.raises(InputError, match="no socket that sensors could be in; ask for a socket, too"):
+        make_phantom(tmp_path / "limb", sensors=lambda *given: {})
 
 
 def test_synthetic_files_hold_the_truth_within_the_stated_error(tmp_path):

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -98,7 +99,7 @@ def describe_measured(study: Study, anatomy: Anatomy | None) -> list[str]:
     if anatomy is None or not tables:
         return [f"socket.measured.{one.name}: {len(read_sensors(study, one).names)} cells" for one in tables]
     thickness = study.socket.liner.thickness_mm
-    outer = build_liner_surface(anatomy, thickness)[0].skin if thickness else anatomy.skin
+    outer = _build_outer_surface(anatomy, thickness) if thickness else anatomy.skin
     socket = build_socket(study, anatomy, outer)
     for one in tables:
         _, states, stretch = place_sensors(study, one, socket, anatomy, outer)
@@ -106,6 +107,11 @@ def describe_measured(study: Study, anatomy: Anatomy | None) -> list[str]:
         words += f"; stretched by {stretch:.1f} %" if stretch else ""
         said.append(f"socket.measured.{one.name}: {words}")
     return said
+
+
+@lru_cache(maxsize=1)  # a check asks twice
+def _build_outer_surface(anatomy: Anatomy, liner_mm: float) -> Surface:
+    return build_liner_surface(anatomy, liner_mm)[0].skin
 
 
 def compare_measured(

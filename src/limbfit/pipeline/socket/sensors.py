@@ -30,7 +30,7 @@ SENSORS: tuple[tuple[str, str, str, SheetLayout | None, str], ...] = (
     ("cells", "cells.csv", "cells", None, ""),
 )
 CELL_MM2, ERROR_KPA, ERROR_PERCENT = 100.0, 2.0, 10.0
-FULL_SHARE, DEAD = 0.9, 20  # the sheet's saturation over its largest true pressure, and its dead cell
+FULL_SHARE, DEAD = 0.98, 20  # the sheet's saturation over its largest true pressure, and its dead cell
 SHARE, FRAMES, STEP_S, NOISE = 0.3, 20, 0.1, 3  # noise in counts of Tekscan's converter
 
 
