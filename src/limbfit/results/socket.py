@@ -169,9 +169,7 @@ class MeasuredCell(ResultPart):
     """What a cell of a sensor read, and what the model has there."""
 
     cell: str = Field(description="Its name; of a sheet, row and column.")
-    state: str = Field(
-        description="`compared`, or why it is not: `saturated`, `dead`, `below noise` or `off the socket`."
-    )
+    state: str = Field(description="`compared`, or why it is not, such as `dead` or `saturated`.")
     regions: Sequence[str] = Field(description="Regions of the limb that it lies on, the smallest first.")
     position_mm: Vector = Field(description="Its place on the donned socket, LPS.")
     level_mm: float = Field(description="Its distance from the limb's distal end, along the limb.")
@@ -201,12 +199,8 @@ class PressureAgreement(ResultPart):
     measured_kPa: float = Field(description="Mean of the measured pressures.")
     model_kPa: float = Field(description="Mean of the model's.")
     bias_kPa: float = Field(description="Mean of model minus measured.")
-    limits_kPa: Interval | None = Field(
-        description="Limits of agreement: 95 % of differences lie between; null: of one cell."
-    )
-    within_percent: float = Field(
-        description="Cells whose difference is within the sensor's error and the model's interval together."
-    )
+    limits_kPa: Interval | None = Field(description="95 % of differences lie between; null: of one cell.")
+    within_percent: float = Field(description="Cells within the sensor's error and the model's interval.")
 
 
 class SocketResult(SocketSimulation, StoredResult):

@@ -230,9 +230,8 @@ def draw_measured_figure(content: stored.SocketResult) -> Figure | None:
     if not content.sensors:
         return None
     drawing, axes = make_panels(2 * len(content.sensors), 2, 2.9)
-    values = [cell.model_kPa for one in content.sensors for cell in one.cells if cell.state == COMPARED]
-    values += [cell.measured_kPa or 0.0 for one in content.sensors for cell in one.cells]
-    limits = Normalize(0.0, max(values, default=1.0))
+    cells = [cell for one in content.sensors for cell in one.cells]
+    limits = Normalize(0.0, max(max(cell.measured_kPa or 0.0, cell.model_kPa) for cell in cells))
     for ax, (one, key) in zip(axes, product(content.sensors, ("measured_kPa", "model_kPa")), strict=True):
         angle = np.array([cell.angle_deg for cell in one.cells])
         if one.stretch_percent is not None:  # a sheet may lie where angles start
@@ -241,8 +240,8 @@ def draw_measured_figure(content: stored.SocketResult) -> Figure | None:
             here = [i for i, cell in enumerate(one.cells) if cell.state == state]
             level, shade = ([getattr(one.cells[i], name) or 0.0 for i in here] for name in ("level_mm", key))
             ax.scatter(angle[here], level, 40, shade, marker=mark, norm=limits, label=state if here else "")
-        words = "measured" if key == "measured_kPa" else "model"
-        ax.set(title=f"{one.name}, {one.load}: {words}", xlabel="Around the limb (°)", ylabel="Level (mm)")
+        title = f"{one.name}, {one.load}: {key.removesuffix('_kPa')}"
+        ax.set(title=title, xlabel="Around the limb (°)", ylabel="Level (mm)")
     drawing.colorbar(axes[0].collections[0], ax=axes, label="Pressure (kPa)", fraction=0.03)
     add_legend(drawing, max(axes, key=lambda ax: len(ax.get_legend_handles_labels()[1])))
     return make_figure(drawing, "socket-measured-maps")
