@@ -87,27 +87,28 @@ def test_a_marker_of_3d_slicer_places_a_cell_and_an_unknown_one_is_refused(tmp_p
 
 
 def test_cells_move_with_the_socket_and_average_the_pressure_over_their_area(tmp_path):
-    """A pressure that is linear along the limb; the limb stays, or turns and goes along with the socket."""
+    """A pressure that is linear in space; the limb stays, or turns and goes along with the socket."""
     study, anatomy = load_study(small_limb(tmp_path, BARE)), limb()
     run_limb = SocketLimb(study, anatomy, anatomy, None, build_regions(study, anatomy), ())
     socket = build_socket(study, anatomy, anatomy.skin)
     mesh, _ = run_limb.mesh(tmp_path, socket, lambda words: None)
     run = SocketRun("socket", run_limb, mesh, {}, socket)
-    move, degrees, none = np.array([1.0, 0.0, 6.0]), np.array([0.0, 0.0, 10.0]), np.zeros(3)
+    move, degrees, none = np.array([0.0, 0.0, 6.0]), np.array([0.0, 0.0, 10.0]), np.zeros(3)
     middles = mesh.points[mesh.face_sets["skin"][:, :3]].mean(axis=1)
     points = middles[socket.find_covered(middles)][::7]
     nodes, still = mesh.points - run.fit.pivot, np.zeros_like(mesh.points)
     turn = Rotation.from_euler("z", 10.0, degrees=True)
     along = turn.apply(nodes) - nodes + move @ run.fit.frame
     strains = Strains(*(np.zeros(len(mesh.cells)) for _ in range(4)))
-    for share, away, shift in ((0.0, still, 0.0), (1.0, along, 0.0), (1.0, still, 0.2 * 6.0)):
+    slopes, at = np.array([0.3, 0.0, 0.2]), points - run.fit.pivot
+    for share, away, place in ((0.0, still, at), (1.0, along, at), (1.0, still, turn.apply(at) + move)):
         patch = Patch(0.0, 0.0, 0.0, 0.0)
         row = SocketStep(0.0, none, none, share * move, share * degrees, 0.0, 0.0, 0.0, patch, {})
-        held = LoadedState(row, 20.0 + 0.2 * nodes[:, 2], still, away, strains, {})
+        held = LoadedState(row, 20.0 + nodes @ slopes, still, away, strains, {})
         found, _ = sample_pressure(run, held, points, np.full(len(points), 30.0))
-        off = found - (20.0 + 0.2 * (points - run.fit.pivot)[:, 2]) - shift
-        assert abs(np.median(off)) < 0.05
-        assert np.percentile(np.abs(off), 90) < 0.3
+        off = found - (20.0 + place @ slopes)
+        assert abs(np.median(off)) < 0.15
+        assert np.percentile(np.abs(off), 90) < 1.0  # between facets; turned the other way it is 4
 
 
 def test_agreement_is_that_of_bland_and_altman_over_the_cells_that_are_compared():
