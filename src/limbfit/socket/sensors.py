@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from itertools import takewhile
 from pathlib import Path
 from typing import Any, NamedTuple
+from warnings import catch_warnings
 
 import numpy as np
 from scipy.ndimage import convolve
@@ -88,14 +89,14 @@ def read_recording(file: Path, layout: SheetLayout | None, kind: str, **stated: 
 
     Raises `InputError` with the file, the place in it and the remedy. ``stated``: fields in place of its own.
     """
-    with add_location(file=file):
-        lines = file.read_text(encoding="utf-8-sig", errors="replace").splitlines()
+    with add_location(file=file), catch_warnings(action="ignore"):  # NumPy's, of what is empty
         try:
+            lines = file.read_text(encoding="utf-8-sig", errors="replace").splitlines()
             if layout is not None:
                 found = _read_pliance(lines, layout)
             else:
                 found = _read_cells(lines) if kind == "cells" else _read_tekscan(lines)
-        except (ValueError, IndexError) as error:
+        except (OSError, ValueError, IndexError) as error:
             raise InputError(f"not readable: {error}", place="numbers", remedy=_AGAIN) from None
         found = replace(found, **stated)
         if not len(found.frames):
@@ -135,7 +136,7 @@ def _read_tekscan(lines: Sequence[str]) -> SensorFrames:
     rows, columns, counts = (int(stated.get(name, 0)) for name in ("ROWS", "COLS", "NOISE_THRESHOLD"))
     data = [line.rstrip(",") for line in lines[len(head) + 1 :] if line[:1].isdigit() or line[:1] == "B"]
     table = np.genfromtxt(data, delimiter=",", ndmin=2)  # B is nan
-    if not table.size or table.shape[1] != columns or len(table) % rows:
+    if not table.size or rows < 1 or table.shape[1] != columns or len(table) % rows:
         what = f"frames that are not of {rows} rows of {columns} cells"
         raise InputError(what, place="Frame", remedy=_AGAIN)
     frames = table.reshape(-1, rows, columns)
