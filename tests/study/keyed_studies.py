@@ -212,6 +212,7 @@ READ: dict[str, str] = {
     ),
     **{key: "pipeline/socket/shape.py" for key in KEYS if key.startswith("socket.")},
     **{key: "study/socket.py" for key in KEYS if key.startswith("socket.liner.")},
+    **{key: "pipeline/socket/measured.py" for key in KEYS if key.startswith("socket.measured.")},
     **dict.fromkeys(
         (
             *("socket.friction", "socket.donning", "socket.travel_mm"),

@@ -100,6 +100,10 @@ def show_socket(found: SocketResult) -> None:
         print_line(f"95 %: by derivatives and {found.samples.simulated} simulated draws{words}")
     if found.worn_s:
         print_line(f"95 %: with what relaxation may do until the socket has been worn for {found.worn_s:g} s")
+    for row in (row for row in found.agreement if row.region == "all"):
+        limits = f" (95 % limits of agreement {format_ends(row.limits_kPa, '.1f')})" if row.limits_kPa else ""
+        inside = f"{row.within_percent:.0f} % of {row.cells} cells within error and interval"
+        print_line(f"{row.load}: model minus measured {row.bias_kPa:.1f} kPa{limits}; {inside}")
     balance = f"contact balances the loads within {found.balance_percent:.2g} %"
     print_line(f"tissues: {found.parameters_from}; {balance}; not a medical device")
     print_warnings(found.outside_text)

@@ -7,6 +7,7 @@ DIR/
   truth/                      the true surfaces
   truth.json                  parameters, sites, limb, how the forces were made
   socket/socket.stl           a rectified socket, where one is asked for
+  sensors/                    what sensors in it record, where they are asked for
   study.toml                  what a user would write
 """
 
@@ -42,6 +43,7 @@ from .robot import DETAIL_SITES, INDENTER_EDGE_MM, INDENTER_MM, TrueForce, TrueS
 
 Mapping = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
 Listener = Callable[[str, float, float], None]
+SensorWriter = Callable[[Path, Anatomy, Parameters, int], dict[str, Any]]
 
 PARAMETER_BASE: Parameters = {
     "skin": {"c_kPa": 7.5, "m": 6.0, "gamma": 2.5, "tau_s": 0.5},
@@ -125,6 +127,7 @@ def make_phantom(
     shear_waves: bool = False,
     tendon: bool = False,
     limb: str = "transtibial",
+    sensors: SensorWriter | None = None,
     mapping: Mapping = map,
     progress: Listener | None = None,
 ) -> dict[str, Any]:
@@ -146,6 +149,8 @@ def make_phantom(
     shear_waves : beside each record the speeds of shear waves under the indenter, to 0.1 m/s at 1 Hz.
     tendon : also a patellar tendon, a stiffer region of the muscle, in a label map that the study names.
     limb : which kind, ``transtibial`` or ``transfemoral``.
+    sensors : given the folder, true surfaces and parameters, and the seed, writes what sensors in the socket
+        record, names it in the study and returns what is true of it.
     mapping : like ``map``; given one that works in several processes, sites are meshed and simulated side by
         side.
     progress : called with what is being done, how much of it is done, and of how much.
@@ -154,6 +159,8 @@ def make_phantom(
     tell = progress or (lambda text, done, total: None)
     if detail not in DETAIL_GRIDS:
         raise InputError(f"unknown detail {detail!r}", remedy=f"use one of {', '.join(DETAIL_GRIDS)}")
+    if sensors is not None and not socket:
+        raise InputError("there is no socket that sensors could be in", remedy="ask for a socket, too")
     made_limb = geometry.make_limb(seed, SKIN_AND_FAT if fat else SKIN_LAYER, tendon, limb)
     marked = robot.build_true_sites(made_limb, seed)
     patient = _Patient(
@@ -174,6 +181,9 @@ def make_phantom(
         _write_images(work, patient, tell)
         truth["sites"] = _write_traces(work, patient, anatomy, mapping, tell)
         (work / "study.toml").write_text(_format_study(patient), encoding="utf-8")
+        if sensors is not None:
+            tell("sensors", 0, 1)
+            truth["sensors"] = sensors(work, anatomy, patient.parameters, seed)
         (work / "truth.json").write_text(json.dumps(truth, indent=1), encoding="utf-8")
     return truth
 
@@ -329,13 +339,19 @@ def _truth_to_dict(patient: _Patient) -> dict[str, Any]:
     }
 
 
-def _format_study(patient: _Patient) -> str:
-    """The content of ``study.toml`` for the indented sites, as a user would write it."""
+def render_template(name: str, **facts: Any) -> str:
+    """Render a file of the phantom by its template."""
     loader = PackageLoader("limbfit.phantom", "templates")
     environment = Environment(
         loader=loader, undefined=StrictUndefined, trim_blocks=True, keep_trailing_newline=True
     )
-    return environment.get_template("study.toml.j2").render(
+    return environment.get_template(name).render(facts)
+
+
+def _format_study(patient: _Patient) -> str:
+    """The content of ``study.toml`` for the indented sites, as a user would write it."""
+    return render_template(
+        "study.toml.j2",
         sites=patient.indented,
         detail=patient.detail,
         seed=patient.seed,

@@ -166,6 +166,44 @@ class SocketSamples(ResultPart):
     failed: Sequence[str] = Field(description="Why others did not.")
 
 
+class MeasuredCell(ResultPart):
+    """What a cell of a sensor read, and what the model has there."""
+
+    cell: str = Field(description="Its name; of a sheet, row and column.")
+    state: str = Field(description="`compared`, or why it is not, such as `dead` or `saturated`.")
+    regions: Sequence[str] = Field(description="Regions of the limb that it lies on, the smallest first.")
+    position_mm: Vector = Field(description="Its place on the donned socket, LPS.")
+    level_mm: float = Field(description="Its distance from the limb's distal end, along the limb.")
+    angle_deg: float = Field(description="Its direction about the limb.")
+    measured_kPa: float | None = Field(description="Mean of its readings; null: it has none.")
+    error_kPa: float = Field(description="What 95 % of readings are within.")
+    model_kPa: float = Field(description="Mean pressure of the model over its area.")
+    interval_kPa: Interval | None = Field(description="95 % interval of that; null: not known.")
+
+
+class SensorComparison(ResultPart):
+    """A recording of sensors beside the model."""
+
+    name: str = Field(description="Name of the recording.")
+    load: str = Field(description="The load that it belongs to.")
+    stretch_percent: float | None = Field(description="How a sheet stretches over the face; null: no sheet.")
+    counts: Mapping[str, int] = Field(description="Number of cells in each state.")
+    cells: Sequence[MeasuredCell] = Field(description="Each cell.")
+
+
+class PressureAgreement(ResultPart):
+    """How the model agrees with the cells that are compared, under a load."""
+
+    load: str = Field(description="Name of the load.")
+    region: str = Field(description="Region of the limb, or `all`.")
+    cells: int = Field(description="Number of cells.")
+    measured_kPa: float = Field(description="Mean of the measured pressures.")
+    model_kPa: float = Field(description="Mean of the model's.")
+    bias_kPa: float = Field(description="Mean of model minus measured.")
+    limits_kPa: Interval | None = Field(description="95 % of differences lie between; null: of one cell.")
+    within_percent: float = Field(description="Cells within the sensor's error and the model's interval.")
+
+
 class SocketResult(SocketSimulation, StoredResult):
     """The study's socket on the limb."""
 
@@ -180,6 +218,8 @@ class SocketResult(SocketSimulation, StoredResult):
     samples: SocketSamples | None = Field(description="Draws that were simulated too; null: none.")
     worn_s: float | None = Field(description="How long the socket has been worn in the intervals.")
     outside_text: Sequence[str] = Field(description="What it does that no fitted record did.")
+    sensors: Sequence[SensorComparison] = Field(default=(), description="Measured pressures beside it.")
+    agreement: Sequence[PressureAgreement] = Field(default=(), description="How they agree, by region.")
 
 
 class TargetPressure(ResultPart):

@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import Annotated, Literal, get_args
 
+import numpy as np
 from pydantic import Field
 
 from .tables import Friction, Plane, Positive, TomlTable, Vector, find_repeated
@@ -21,6 +22,9 @@ LINERS: dict[str, dict[str, float]] = {
 
 # Names that results have for something else.
 TAKEN_NAMES = {"areas": set[str](), "loads": {"donning"}, "regions": {"the limb", "settling"}}
+TAKEN_NAMES |= {"measured": set()}
+# Keys of `MeasuredTable` for sheets, and for those whose file does not state their layout.
+SHEET_KEYS, LAYOUT_KEYS = ("landmarks", "markups", "from_s", "to_s"), ("rows", "columns", "spacing_mm")
 
 
 class DesignRegionTable(TomlTable):
@@ -107,6 +111,61 @@ class SocketLoadTable(TomlTable):
             raise ValueError("a preset has its own moment; give force_N with moment_Nmm instead")
 
 
+class LandmarkTable(TomlTable):
+    """A cell of a sheet, counted from 1, and where it lies: at a point (LPS, mm), or at a marker."""
+
+    row: Annotated[int, Field(ge=1)]
+    column: Annotated[int, Field(ge=1)]
+    position: Vector | None = None
+    marker: str | None = None
+
+    def check_keys(self) -> None:
+        if (self.position is None) == (self.marker is None):
+            raise ValueError("give either position (LPS, mm) or marker (a point of markups)")
+
+
+class MeasuredTable(TomlTable):
+    """What sensors in the socket recorded under a load, and their error: what 95 % of readings are within.
+
+    Both errors count together. A sheet lies where its ``landmarks`` say, of which some may be control points
+    of a file of 3D Slicer, ``markups``; ``spacing_mm`` is from row to row and from column to column.
+    """
+
+    name: str = Field(pattern=NAME)
+    load: str
+    file: Path
+    format: Literal["cells", "tekscan", "pliance"]
+    error_kPa: Length = 0.0
+    error_percent: Length = 0.0
+    noise_kPa: Length | None = None
+    saturation_kPa: Positive | None = None
+    from_s: float | None = None
+    to_s: float | None = None
+    rows: Annotated[int, Field(ge=2)] | None = None
+    columns: Annotated[int, Field(ge=2)] | None = None
+    spacing_mm: tuple[Positive, Positive] | None = None
+    landmarks: tuple[LandmarkTable, ...] = ()
+    markups: Path | None = None
+    within_mm: Positive = 10.0
+
+    def check_keys(self) -> None:
+        is_sheet, stated = self.format != "cells", self.model_fields_set
+        ruled_out = () if self.format == "pliance" else LAYOUT_KEYS if is_sheet else SHEET_KEYS + LAYOUT_KEYS
+        if wrong := [key for key in ruled_out if key in stated]:
+            raise ValueError(f'{wrong[0]} does not belong to format = "{self.format}"; leave it out')
+        if self.format == "pliance" and (missing := [key for key in LAYOUT_KEYS if key not in stated]):
+            raise ValueError(f"the file does not state the sheet's layout; give {missing[0]}")
+        if not self.error_kPa + self.error_percent:
+            raise ValueError("the sensor's error is not known; give error_kPa, error_percent or both")
+        if (self.markups is None) == any(one.marker is not None for one in self.landmarks):
+            raise ValueError("markups and the landmarks' marker belong together; give both or neither")
+        if is_sheet and len(self.landmarks) < 3:
+            raise ValueError(f"{len(self.landmarks)} landmarks; a sheet is placed by three or more")
+        cells = np.array([(one.row, one.column) for one in self.landmarks])
+        if is_sheet and np.linalg.matrix_rank(cells - cells[0]) < 2:
+            raise ValueError("all landmarks lie on one line of the sheet; add one beside it")
+
+
 class SocketTable(TomlTable):
     """A socket from a file or rectified from the limb; every key has a default.
 
@@ -139,6 +198,7 @@ class SocketTable(TomlTable):
     body_weight_N: Annotated[float, Field(ge=50, le=3000)] = 800.0
     loads: tuple[SocketLoadTable, ...] = (SocketLoadTable(name="single stance", preset="single stance"),)
     regions: tuple[SocketRegionTable, ...] = ()
+    measured: tuple[MeasuredTable, ...] = ()
     design: SocketDesignTable = SocketDesignTable()
 
     def check_keys(self) -> None:
@@ -154,5 +214,10 @@ class SocketTable(TomlTable):
                 raise ValueError(f"{kind}: names must differ; given twice: {doubled[0]}")
             if own := sorted(taken.intersection(names)):
                 raise ValueError(f"{kind}: {own[0]!r} is a name of the results' own; give another")
+        loads = ["donning", *(load.name for load in self.loads)]
+        for one in self.measured:
+            if one.load not in loads:
+                what = f"measured.{one.name}: no load is named {one.load!r}"
+                raise ValueError(f"{what}; there are {', '.join(loads)}")
         if self.edge_mm is not None and self.edge_mm < 0.5 * self.face_edge_mm:
             raise ValueError("edge_mm is shorter than half of face_edge_mm: the face would show its facets")

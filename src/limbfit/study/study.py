@@ -187,6 +187,8 @@ class Study(tables.TomlFile):
             "segmentation.contours": self.segmentation.contours,
             "indenter.file": self.indenter.file,
             "socket.file": self.socket.file,
+            **{f"socket.measured.{one.name}.file": one.file for one in self.socket.measured},
+            **{f"socket.measured.{one.name}.markups": one.markups for one in self.socket.measured},
             **{f"geometry.regions.{one.name}.surface": one.surface for one in self.geometry.regions},
             **{f"indenters.{name}.file": one.file for name, one in self.indenters.items()},
             **{f"study.extensions.{i}": path for i, path in enumerate(self.study.extensions)},

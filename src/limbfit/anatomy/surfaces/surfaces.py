@@ -44,7 +44,7 @@ _PASSES_BEFORE, _PASSES_AFTER = 3, 15
 _STUMP_MM3 = 200.0  # what is left of a bone distal of the cut, below which it is dropped
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Anatomy:
     """Closed surfaces of a limb, LPS mm.
 

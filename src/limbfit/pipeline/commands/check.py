@@ -24,6 +24,7 @@ from ..records.record_checks import choose_surface_points, record_flags
 from ..records.traces import SecondaryMeasurement, read_observed, read_record
 from ..simulation.limb_geometry import LimbGeometry
 from ..simulation.loading import LimbAxis, LoadHistory, describe_indentation, name_load, time_socket_loads
+from ..socket.measured import describe_measured
 from ..socket.shape import build_loadable_socket, build_regions, check_load, check_regions
 from .acquire import build_device_settings
 from .experiments import EXPERIMENTS, check_experiment
@@ -207,9 +208,7 @@ def _describe_outside(
 
 
 def _describe_surface_motion(
-    study: Study,
-    motions: Mapping[str, SurfaceMotion | None],
-    limb: LimbGeometry | None,
+    study: Study, motions: Mapping[str, SurfaceMotion | None], limb: LimbGeometry | None
 ) -> Iterator[str]:
     """How the skin around the indenter moves, and which of its points are compared where sites are known."""
     chosen = {} if limb is None else choose_surface_points(limb, study, motions)
@@ -262,6 +261,7 @@ def _describe_socket(study: Study, anatomy: Anatomy | None, bones: Collection[st
         if bones is not None:
             for load in table.loads:
                 check_load(study, load, bones)
+        describe_measured(study, None)
         return [*facts, "the socket's shape is checked after limbfit run --until sites"]
     socket = build_loadable_socket(study, anatomy, anatomy.skin)
     named = [one.region for one in table.design.regions]
@@ -272,6 +272,7 @@ def _describe_socket(study: Study, anatomy: Anatomy | None, bones: Collection[st
         *(f"socket: {note}" for note in socket.notes),
         f"socket: {socket.volume_mm3 / 1000:.0f} cm3, from {-depth.min():.1f} mm outside the skin to "
         f"{depth.max():.1f} mm inside it",
+        *describe_measured(study, anatomy),
     ]
 
 

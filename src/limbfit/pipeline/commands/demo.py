@@ -16,6 +16,7 @@ from ...phantom.robot import simulate_true_force
 from ...study import load_study
 from ..engine.context import Listener, Progress, ignore_progress
 from ..engine.store import Store, read_json
+from ..socket.sensors import write_true_sensors
 from .run import compile_in_background, run_study
 
 # A site of the paper's kind, of 20,922 nodes, and how often the paper's search improved its parameters.
@@ -28,11 +29,13 @@ def make_phantom_study(
     *,
     listener: Listener = ignore_progress,
     workers: int = 0,
+    sensors: bool = False,
     **options: Any,
 ) -> dict[str, Any]:
     """Make a synthetic patient in ``folder``; returns its truth.
 
-    ``workers``: how many simulate side by side; 0: one per core. ``options``: as
+    ``workers``: how many simulate side by side; 0: one per core. ``sensors``: also what sensors in its socket
+    measure, from a simulation with the true tissues. ``options``: as
     :func:`limbfit.phantom.build.make_phantom` takes them: ``detail``, ``seed``, ``limb``, ``sites``, and what
     else there is: ``fat``, ``tendon``, ``socket``, ``ultrasound``, ``surface``, ``shear_waves``.
     """
@@ -46,6 +49,7 @@ def make_phantom_study(
         return make_phantom(
             Path(folder),
             mapping=map_jobs,
+            sensors=write_true_sensors if sensors else None,
             progress=lambda text, done, total: listener(Progress(f"phantom {text}", done, total)),
             **options,
         )

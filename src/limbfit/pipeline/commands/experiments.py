@@ -126,7 +126,14 @@ _OWN: tuple[Experiment, ...] = (
         check=check_protocol,
     ),
     Experiment("socket", run_socket, ("surfaces",), _SOCKET, apart=("socket.design",), check=check_socket),
-    Experiment("socket_design", run_socket_design, ("surfaces",), _SOCKET, check=check_socket_design),
+    Experiment(
+        "socket_design",
+        run_socket_design,
+        ("surfaces",),
+        _SOCKET,
+        apart=("socket.measured",),
+        check=check_socket_design,
+    ),
 )
 EXPERIMENTS = Registry("experiment", {experiment.name: experiment for experiment in _OWN})
 

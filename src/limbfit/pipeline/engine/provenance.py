@@ -81,8 +81,8 @@ def list_input_files(study: Study) -> dict[str, list[Path]]:
         files["surfaces"] += [study.surfaces.skin, *study.surfaces.bones.values()]
     files["surfaces"] += [one.surface for one in study.geometry.regions if one.surface is not None]
     files["indenters"] = [one.file for one in study.all_indenters.values() if one.file is not None]
-    if study.socket.file is not None:
-        files["socket"] = [study.socket.file]
+    measured = [path for one in study.socket.measured for path in (one.file, one.markups)]
+    files["socket"] = [path for path in (study.socket.file, *measured) if path is not None]
     files["traces"] += [path for record in study.recorded for path in record.files]
     return files
 

@@ -169,7 +169,7 @@ class SocketRun:
         """Of all that decides what the socket does to the limb, whose mesh lies above what is kept."""
         assert self.kept is not None
         study, face, fit = self.limb.study, self.face, self.fit
-        table = study.socket.model_dump(mode="json", exclude={"design", "worn_s"})
+        table = study.socket.model_dump(mode="json", exclude={"design", "worn_s", "measured"})
         # Regions and loads follow from the names of the bones as well, which no mesh and no table holds.
         loads = [(*load.force, *load.moment, *load.point) for load in fit.loads]
         regions = {name: mask.tolist() for name, mask in self.faces.items()}

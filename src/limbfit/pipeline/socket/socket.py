@@ -26,6 +26,7 @@ from ..engine.store import RUNS, ResultFiles, write_result, write_table
 from ..simulation.limb_geometry import LimbGeometry
 from ..simulation.loading import NEAR_MM, LimbAxis, describe_socket_load, name_load, time_socket_loads
 from .intervals import CHANGE_PERCENT, FRICTION, ParameterSpread, draw_step, store_change, widen_intervals
+from .measured import compare_measured, describe_measured
 from .shape import build_loadable_socket, check_tissues
 from .simulation import SocketLimb, SocketRun, run_sockets, simulate_socket, solve_run, summarise_run
 
@@ -41,6 +42,7 @@ def check_socket(study: Study, limb: LimbGeometry | None, options: Mapping[str, 
     check_tissues(study)
     if limb is not None:
         build_loadable_socket(study, limb.anatomy, limb.anatomy.skin)
+    describe_measured(study, None if limb is None else limb.anatomy)
 
 
 def run_socket(
@@ -89,6 +91,7 @@ def run_socket(
         if samples:
             steps = [draw_step(np.array(covariance_log), number) for number in range(samples)]
             simulated = _simulate_samples(context, run, content, steps)
+    sensors, agreement = compare_measured(run, found, content)
     result = SocketResult(
         **content,
         parameters=parameters,
@@ -100,6 +103,8 @@ def run_socket(
         samples=simulated,
         worn_s=None if relaxation is None else study.socket.worn_s,
         outside_text=outside_text,
+        sensors=sensors,
+        agreement=agreement,
     )
     write_result(folder / "socket.json", result)
     for i, one in enumerate(found.held.values()):

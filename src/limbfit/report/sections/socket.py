@@ -2,17 +2,19 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyvista as pv
+from matplotlib.colors import Normalize
 
 from ...arrays import Array
 from ...results import socket as stored
 from ..drawing import pictures
 from ..drawing.colours import MUTED, SIMULATED, THIRD
-from ..drawing.plots import add_legend, make_figure, make_panels, styled
+from ..drawing.plots import add_legend, choose_tissue_style, make_figure, make_panels, styled
 from ..formats import format_symbol
 from ..page import Figure, Note, Row, Section, Table
 from ..store import Results
@@ -26,6 +28,9 @@ KNOWN = {
 FIELDS = (("pressure_kPa", "pressure (kPa)"), ("shear_kPa", "shear (kPa)"))
 OUTER = "face_set:skin"
 SHEAR, MARKED = "shear_strain", "#d62728"
+ALL, COMPARED = "all", "compared"
+# Marker of each state of a cell.
+MARKS = {COMPARED: "s", "saturated": "^", "dead": "x", "below noise": ".", "off the socket": "+"}
 OFFSET, OFFSET_MAP = "offset_mm", "RdBu_r"
 
 
@@ -50,6 +55,10 @@ def make_socket_section(store: Results, content: stored.SocketResult) -> Section
         ),
         make_interval_table(last, name),
         make_prose("socket worn", worn_s=content.worn_s),
+        make_prose("socket measured", agreement=content.agreement, sensors=content.sensors),
+        draw_measured_figure(content),
+        draw_agreement_figure(content),
+        make_table("socket-measured", content.agreement, marked=lambda row: row.region == ALL),
         make_published_table(content.published, last, name),
         make_prose("socket papers") if content.published else None,
         draw_inside_figure(store, name, last.inside, files[name]),
@@ -213,6 +222,49 @@ def _make_cut_views(store: Results, grid: pictures.Grid, place: Array) -> tuple[
     wide = float(np.abs((points - middle) - np.outer((points - middle) @ up, up)).max()) + 8
     across_focal = middle + ((place - middle) @ up) * up
     return along, pictures.View(across_focal, -up, -back, wide, (900, 900))
+
+
+@styled
+def draw_measured_figure(content: stored.SocketResult) -> Figure | None:
+    """Measured pressure of each recording beside the model's, on the limb unrolled, in one colour scale."""
+    if not content.sensors:
+        return None
+    drawing, axes = make_panels(2 * len(content.sensors), 2, 2.9)
+    cells = [cell for one in content.sensors for cell in one.cells]
+    limits = Normalize(0.0, max(max(cell.measured_kPa or 0.0, cell.model_kPa) for cell in cells))
+    for ax, (one, key) in zip(axes, product(content.sensors, ("measured_kPa", "model_kPa")), strict=True):
+        angle = np.array([cell.angle_deg for cell in one.cells])
+        if one.stretch_percent is not None:  # a sheet may lie where angles start
+            angle = np.unwrap(angle, period=360.0)
+        for state, mark in MARKS.items():
+            here = [i for i, cell in enumerate(one.cells) if cell.state == state]
+            level, shade = ([getattr(one.cells[i], name) or 0.0 for i in here] for name in ("level_mm", key))
+            ax.scatter(angle[here], level, 40, shade, marker=mark, norm=limits, label=state if here else "")
+        title = f"{one.name}, {one.load}: {key.removesuffix('_kPa')}"
+        ax.set(title=title, xlabel="Around the limb (°)", ylabel="Level (mm)")
+    drawing.colorbar(axes[0].collections[0], ax=axes, label="Pressure (kPa)", fraction=0.03)
+    add_legend(drawing, max(axes, key=lambda ax: len(ax.get_legend_handles_labels()[1])))
+    return make_figure(drawing, "socket-measured-maps")
+
+
+@styled
+def draw_agreement_figure(content: stored.SocketResult) -> Figure | None:
+    """Bland and Altman's plot of each load: model minus measured over their mean, with bias and limits."""
+    rows = [row for row in content.agreement if row.region == ALL]
+    if not rows:
+        return None
+    drawing, axes = make_panels(len(rows), 2, 2.9)
+    for ax, row in zip(axes, rows, strict=True):
+        for i, one in enumerate(sensor for sensor in content.sensors if sensor.load == row.load):
+            pairs = [(c.measured_kPa or 0.0, c.model_kPa) for c in one.cells if c.state == COMPARED]
+            measured, model = np.array(pairs).reshape(-1, 2).T
+            style = choose_tissue_style(i) | {"ls": "", "ms": 4, "label": one.name}
+            ax.plot((measured + model) / 2, model - measured, **style)
+        for value in (row.bias_kPa, *(row.limits_kPa or ())):
+            ax.axhline(value, color=MUTED, lw=1.0, ls="-" if value == row.bias_kPa else "--")
+        ax.set(title=row.load, xlabel="Mean of both (kPa)", ylabel="Model minus measured (kPa)")
+    add_legend(drawing, axes[0])
+    return make_figure(drawing, "socket-agreement")
 
 
 @styled

@@ -1,0 +1,201 @@
+"""Pressures that sensors in the socket measured, beside those of the model at the same places.
+
+Cells move and turn with the socket, and the limb slides under them. The model's pressure is the mean over a
+cell's area; its interval is that of the smallest region around the cell, in proportion to the pressures.
+Agreement is that of Bland and Altman (Lancet 1986, 327:307): the mean of model minus measured, and limits
+between which 95 % of such differences lie.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from ...anatomy.meshing.layers import build_liner_surface
+from ...anatomy.sites.markups import read_markups
+from ...anatomy.surfaces.surfaces import Anatomy
+from ...anatomy.surfaces.thickness import transfer_values
+from ...anatomy.surfaces.triangles import Surface
+from ...arrays import Array, Indices
+from ...donning import DonningResult, LoadedState, extract_outer_surface
+from ...donning.model import OUTER
+from ...errors import StudyError, add_location
+from ...identify.fit.prediction import NORMAL_95
+from ...results.socket import MeasuredCell, PressureAgreement, SensorComparison
+from ...socket import Socket
+from ...socket.rays import compute_profile
+from ...socket.sensors import COMPARED, SensorFrames, SheetLayout, read_recording
+from ...socket.wrapping import wrap_sheet
+from ...study import Study
+from ...study.socket import MeasuredTable
+from ..simulation.loading import LimbAxis
+from .shape import build_socket, place_errors
+from .simulation import SocketRun
+
+OFF, ALL = "off the socket", "all"  # a cell that the face does not reach, and cells of any region
+# Points of a disc of radius 1, and their weights: exact to the fifth order (Abramowitz and Stegun, 25.4.61).
+_TURNS = np.radians(60.0 * np.arange(6))
+DISC = np.vstack([[0.0, 0.0], np.sqrt(2.0 / 3.0) * np.column_stack([np.cos(_TURNS), np.sin(_TURNS)])])
+WEIGHTS = np.array([1 / 4, *[1 / 8] * 6])
+
+
+def read_sensors(study: Study, table: MeasuredTable) -> SensorFrames:
+    """Read a recording; what the study states wins over its file. Raises `InputError` with the remedy."""
+    layout = None
+    if table.rows and table.columns and table.spacing_mm:
+        layout = SheetLayout((table.rows, table.columns), table.spacing_mm)
+    keys = {"from_s": "start_s", "to_s": "end_s"} | {key: key for key in ("noise_kPa", "saturation_kPa")}
+    stated = {keys[key]: value for key, value in table if key in keys and value is not None}
+    return read_recording(study.path(table.file), layout, table.format, **stated)
+
+
+def place_sensors(
+    study: Study, table: MeasuredTable, socket: Socket, anatomy: Anatomy, outer: Surface
+) -> tuple[SensorFrames, list[str], float | None]:
+    """Place what a table of ``socket.measured`` states on a socket around the ``outer`` surface of a limb.
+
+    Returns the recording with positions, what each cell is, `OFF` where the socket does not reach it, and by
+    how many percent a sheet stretches. Raises `InputError` for what cannot be right, with the remedy.
+    """
+    recording, place = read_sensors(study, table), f"socket.measured.{table.name}"
+    points, layout, stretch = recording.position, recording.layout, None
+    with add_location(study.file, place), place_errors(study, place):
+        known = {} if table.markups is None else read_markups(study.path(table.markups))
+        for one in table.landmarks:
+            if one.marker is not None and one.marker not in known:
+                raise StudyError(f"no marker is named {one.marker!r}", remedy=f"there are {', '.join(known)}")
+            if layout and (one.row > layout.shape[0] or one.column > layout.shape[1]):
+                remedy = f"there are {layout.shape[0]} rows of {layout.shape[1]} cells"
+                raise StudyError(f"no cell {one.row}-{one.column} for a landmark", remedy=remedy)
+        if points is None:
+            points = np.array([known[one.marker] if one.marker else one.position for one in table.landmarks])
+        far = np.sqrt(socket.surface.find_nearest(points)[0])
+        if far.max() > table.within_mm:
+            what = "landmark" if layout else "cell"
+            what += f" {far.argmax() + 1} lies {far.max():.0f} mm from the socket's face"
+            raise StudyError(what, remedy="correct its position (LPS, mm), or state a larger within_mm")
+        if layout is not None and recording.place is not None:
+            cells = np.array([(one.row - 1, one.column - 1) for one in table.landmarks])
+            rays = compute_profile(outer, anatomy.frame).rays
+            whole, stretch = wrap_sheet(layout, cells, points, socket, rays, anatomy.frame)
+            points = whole[tuple(recording.place.T)]
+    covers = socket.find_covered(points)
+    states = [state if there else OFF for state, there in zip(recording.states, covers, strict=True)]
+    return replace(recording, position=points), states, stretch
+
+
+def describe_measured(study: Study, anatomy: Anatomy | None) -> list[str]:
+    """Say what is known of the recordings of ``socket.measured``; they are placed where the limb is known.
+
+    The socket is drawn around the liner, or a sheet would be too long for it. Errors as `place_sensors`.
+    """
+    tables, said = study.socket.measured, []
+    if anatomy is None or not tables:
+        return [f"socket.measured.{one.name}: {len(read_sensors(study, one).names)} cells" for one in tables]
+    thickness = study.socket.liner.thickness_mm
+    outer = _build_outer_surface(anatomy, thickness) if thickness else anatomy.skin
+    socket = build_socket(study, anatomy, outer)
+    for one in tables:
+        _, states, stretch = place_sensors(study, one, socket, anatomy, outer)
+        words = ", ".join(f"{count} {state}" for state, count in sorted(Counter(states).items()))
+        words += f"; stretched by {stretch:.1f} %" if stretch else ""
+        said.append(f"socket.measured.{one.name}: {words}")
+    return said
+
+
+@lru_cache(maxsize=1)  # a check asks twice
+def _build_outer_surface(anatomy: Anatomy, liner_mm: float) -> Surface:
+    return build_liner_surface(anatomy, liner_mm)[0].skin
+
+
+def compare_measured(
+    run: SocketRun, found: DonningResult, content: Mapping[str, Any]
+) -> tuple[list[SensorComparison], list[PressureAgreement]]:
+    """Compare every recording of a study with a simulation, whose intervals are those of its ``content``."""
+    limb, axis, sensors = run.limb, LimbAxis(run.limb.anatomy), []
+    held = {one["name"]: one for one in content["loads"]} | {"donning": content["donning"]}
+    sizes = {name: mask.sum() for name, mask in run.faces.items()}
+    for table in limb.study.socket.measured:
+        recording, states, stretch = place_sensors(limb.study, table, run.face, limb.anatomy, limb.outer.skin)
+        assert recording.position is not None
+        model, faces = sample_pressure(run, found.held[table.load], recording.position, recording.area_mm2)
+        mean = recording.frames.mean(axis=0)
+        rows = {row["region"]: row for row in held[table.load]["regions"]}
+        around = [sorted((n for n in sizes if run.faces[n][face]), key=sizes.__getitem__) for face in faces]
+        columns = {
+            "cell": recording.names,
+            "state": states,
+            "regions": around,
+            "position_mm": recording.position,
+            "level_mm": axis.measure_level(recording.position),
+            "angle_deg": axis.measure_angle(recording.position),
+            "measured_kPa": [value if np.isfinite(value) else None for value in mean.tolist()],
+            "error_kPa": np.hypot(table.error_kPa, 0.01 * table.error_percent * np.nan_to_num(mean)),
+            "model_kPa": model,
+            "interval_kPa": [_scale_interval(p, [rows[n] for n in names]) for p, names in zip(model, around)],
+        }
+        named = {"name": table.name, "load": table.load, "stretch_percent": stretch}
+        cells = [dict(zip(columns, values)) for values in zip(*columns.values(), strict=True)]
+        sensors.append(SensorComparison.model_validate({**named, "counts": Counter(states), "cells": cells}))
+    return sensors, summarise_agreement(sensors)
+
+
+def _scale_interval(value: float, rows: Sequence[Mapping[str, Any]]) -> list[float] | None:
+    """The interval of the first region that has one, in proportion to a value; None where none has."""
+    known = (row for row in rows if row["interval_kPa"] is not None and row["mean_kPa"] > 0.0)
+    return next(([value * end / row["mean_kPa"] for end in row["interval_kPa"]] for row in known), None)
+
+
+def sample_pressure(
+    run: SocketRun, held: LoadedState, points: Array, area_mm2: Array
+) -> tuple[Array, Indices]:
+    """Mean pressure (n,) kPa over discs on the socket, and the face (n,) of the limb's mesh below each.
+
+    ``points`` (n, 3) are their middles where the socket is donned, with areas (n,).
+    """
+    fit, outer, row = run.fit, run.mesh.face_sets[OUTER], held.row
+    turn = Rotation.from_rotvec(np.radians(row.turn) @ fit.frame)
+    surface = extract_outer_surface(run.mesh, held.displacement)
+    moved = fit.pivot + row.move @ fit.frame + turn.apply(points - fit.pivot)
+    _, face, foot = surface.find_nearest(moved)
+    normal = surface.face_normals[face]
+    along = np.cross(normal, np.eye(3)[np.abs(normal).argmin(axis=1)])
+    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    across = DISC @ np.stack([along, np.cross(normal, along)], axis=1)
+    over = foot[:, None] + np.sqrt(area_mm2 / np.pi)[:, None, None] * across
+    values = transfer_values(surface, held.pressure[np.unique(outer)][None], over.reshape(-1, 3))[0]
+    return values.reshape(-1, len(DISC)) @ WEIGHTS, face % len(outer)
+
+
+def summarise_agreement(sensors: Sequence[SensorComparison]) -> list[PressureAgreement]:
+    """How model and measured pressures agree, by load and by region: all cells first, then each region."""
+    inside: dict[tuple[str, str], list[MeasuredCell]] = {}
+    for one in sensors:
+        for cell in (cell for cell in one.cells if cell.state == COMPARED):
+            for region in (ALL, *cell.regions):
+                inside.setdefault((one.load, region), []).append(cell)
+    return [_compute_agreement(load, region, cells) for (load, region), cells in inside.items()]
+
+
+def _compute_agreement(load: str, region: str, cells: Sequence[MeasuredCell]) -> PressureAgreement:
+    measured, error, model = np.array([(c.measured_kPa, c.error_kPa, c.model_kPa) for c in cells], float).T
+    ends = np.array([cell.interval_kPa or (cell.model_kPa, cell.model_kPa) for cell in cells])
+    off = model - measured
+    half = np.abs(np.where(off > 0.0, ends[:, 0], ends[:, 1]) - model)  # on the side of the reading
+    bias, spread = float(off.mean()), NORMAL_95 * float(np.std(off, ddof=1)) if len(off) > 1 else None
+    return PressureAgreement(
+        load=load,
+        region=region,
+        cells=len(cells),
+        measured_kPa=float(measured.mean()),
+        model_kPa=float(model.mean()),
+        bias_kPa=bias,
+        limits_kPa=None if spread is None else (bias - spread, bias + spread),
+        within_percent=100.0 * float(np.mean(np.abs(off) <= np.hypot(error, half))),
+    )
