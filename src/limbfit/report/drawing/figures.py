@@ -35,11 +35,9 @@ def draw_force_figure(store: Results, rows: Rows, against: str, name: str, colum
     words = "time" if against == "time_s" else "displacement"
     plots.label_outer(axes, columns, "Time (s)" if against == "time_s" else "Displacement (mm)", "Force (N)")
     for ax, (row, curves) in zip(axes, pairs, strict=True):
-        _draw_forces(ax, thin_curves(curves), against, store.materials)
+        draw_forces(ax, thin_curves(curves), against, "simulated", store.materials)
         ax.set_title(_make_site_title(row, columns))
-        if (quantity := find_compared_quantity(curves)) != ("force", "N"):
-            ax.set_ylabel(f"{quantity[0].capitalize()} ({quantity[1]})")
-    plots.add_legend(drawing, max(axes, key=lambda ax: len(ax.get_legend_handles_labels()[1])))
+    plots.add_legend(drawing, *axes)
     shown, paper = [row for row, _ in pairs], name == "forces-fitted"
     return plots.make_figure(drawing, name, words="forces", rows=shown, against=words, paper=paper)
 
@@ -51,9 +49,10 @@ def _make_site_title(row: RecordPrediction, columns: int) -> str:
     return f"{head}: {format_fixed(row.error_percent)} %"
 
 
-def _draw_forces(ax: Axes, curves: Curves, against: str, materials: str) -> None:
+def draw_forces(ax: Axes, curves: Curves, against: str, kind: str, name: str) -> None:
+    """A record as measured and as simulated, which columns of the ``kind`` have, with its interval."""
     x, (quantity, unit) = curves[against], find_compared_quantity(curves)
-    kinds = ("low", "high", "measured", "one_material", "simulated")
+    kinds = ("low", "high", "measured", "one_material", kind)
     low, high, measured, one, simulated = (curves.get(f"{quantity}_{kind}_{unit}") for kind in kinds)
     if low is not None and high is not None and against == "time_s":
         plots.plot_band(ax, x, low, high)
@@ -62,7 +61,9 @@ def _draw_forces(ax: Axes, curves: Curves, against: str, materials: str) -> None
     if one is not None:
         ax.plot(x, one, color=ONE_MATERIAL, ls=(0, (5, 2)), label="one material")
     if simulated is not None:
-        ax.plot(x, simulated, color=SIMULATED, label=materials)
+        ax.plot(x, simulated, color=SIMULATED, label=name)
+    if quantity != "force":
+        ax.set_ylabel(f"{quantity.capitalize()} ({unit})")
     ax.margins(x=0.01)
 
 
@@ -93,8 +94,7 @@ def draw_domain_figure(store: Results) -> Figure | None:
         plots.set_log_scale(ax, minor=not loads)
         ax.set_ylim(bottom=0.0)
         ax.set_title(tissue)
-    handles = dict(zip(*reversed(axes[0].get_legend_handles_labels()), strict=True))
-    drawing.legend(list(handles.values()), list(handles), loc="outside upper left", ncols=4, labelcolor=INK)
+    plots.add_legend(drawing, axes[0], columns=4)
     return plots.make_figure(drawing, "domain")
 
 

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from ...arrays import Array
 from ...mesh import read_vtu
-from ...results.identification import SearchIteration
 from ...results.limb import PlacedSite
 from ...web import extract_interface, pack, read_shell, to_shell, to_volume_shape
 from ..formats import format_symbol, format_unit
@@ -191,7 +190,10 @@ def draw_convergence_curves(store: Results) -> InteractiveFigure | None:
     steps = [step for stage in store.stages for step in stage.iterations]
     if not steps:
         return None
-    panels = [_make_error_panel(steps)]
+    errors = [{"label": "mean error", "y": [step.error_percent for step in steps]}]
+    for site in sorted(steps[0].error_percent_by_site):
+        errors.append({"label": f"site {site}", "y": [step.error_percent_by_site[site] for step in steps]})
+    panels: list[Json] = [{"title": "Error", "unit": "%", "log": True, "series": errors}]
     for name in store.law.keys:
         series = [
             {"label": tissue, "y": [step.parameters[tissue][name] for step in steps]}
@@ -202,10 +204,3 @@ def draw_convergence_curves(store: Results) -> InteractiveFigure | None:
     caption = write_words("figure iterates")
     label = "Error and parameters over the iterates."
     return InteractiveFigure("iterates", "iterates", label, caption, {"panels": panels})
-
-
-def _make_error_panel(steps: Sequence[SearchIteration]) -> Json:
-    series = [{"label": "mean error", "y": [step.error_percent for step in steps]}]
-    for site in sorted(steps[0].error_percent_by_site):
-        series.append({"label": f"site {site}", "y": [step.error_percent_by_site[site] for step in steps]})
-    return {"title": "Error", "unit": "%", "log": True, "series": series}

@@ -80,10 +80,13 @@ def make_panels(count: int, columns: int, height_in: float) -> tuple[Drawing, li
 
 
 def add_legend(drawing: Drawing, *axes: Axes, columns: int | None = None) -> None:
-    """The legend of some panels over all of them."""
-    handles = [handle for ax in axes for handle in ax.get_legend_handles_labels()[0]]
-    labels = [str(handle.get_label()) for handle in handles]
-    drawing.legend(handles, labels, loc="outside upper left", ncols=columns or len(labels), labelcolor=INK)
+    """The legend of some panels over all of them, each label once."""
+    named: dict[str, Any] = {}
+    for ax in axes:
+        for handle, label in zip(*ax.get_legend_handles_labels(), strict=True):
+            named.setdefault(label, handle)
+    handles, columns = list(named.values()), columns or len(named)
+    drawing.legend(handles, list(named), loc="outside upper left", ncols=columns, labelcolor=INK)
 
 
 def label_outer(axes: Sequence[Axes], columns: int, x: str, y: str) -> None:

@@ -5,34 +5,13 @@ from typing import Any
 
 import numpy as np
 import pyvista as pv
+from matplotlib.figure import Figure as Drawing
 from scipy.spatial import KDTree
 
 from ...errors import InputError
 from ...mesh import compute_dihedral_angles
 from ..store import Results, load_store
-from .pictures import (
-    BONE,
-    MATT,
-    SIDES,
-    SKIN_SURFACE,
-    Drawing,
-    Mark,
-    PictureRow,
-    View,
-    build_figure_sheet,
-    choose_inner_colour,
-    choose_region_colours,
-    make_field_plotter,
-    make_four_views,
-    make_key,
-    make_limb_plotter,
-    make_mesh_rows,
-    normalise,
-    render_cut_meshes,
-    render_views,
-    silence_display_warning,
-    write_png,
-)
+from . import pictures
 
 CUT_PLANE = "#0072b2"
 # Okabe and Ito's colours, for regions of sites.
@@ -48,26 +27,35 @@ def draw_stage(results: Path, stage: str, file: Path) -> Path:
     store = load_store(results)
     if "skin" not in store.surface_files:
         raise InputError("no surfaces are stored", file=results, remedy="run the stage surfaces first")
-    with silence_display_warning():
-        write_png(_SHEETS[stage](store), file)
+    with pictures.silence_display_warning():
+        pictures.write_png(_SHEETS[stage](store), file)
     return file
 
 
 def draw_surfaces_sheet(store: Results) -> Drawing:
     """Four sides: skin translucent over the bones with the plane of the cut; and tissue in colours."""
     skin = pv.read(store.surface_files["skin"])
-    plotter = make_limb_plotter(store, skin)
+    plotter = pictures.make_limb_plotter(store, skin)
     plotter.add_mesh(_make_cut_plane(store, skin), color=CUT_PLANE, opacity=0.55, lighting=False)
-    views = make_four_views(store, skin)
-    rows = [PictureRow(render_views(plotter, views), SIDES)]
+    views = pictures.make_four_views(store, skin)
+    rows = [pictures.PictureRow(pictures.render_views(plotter, views), pictures.SIDES)]
     for thickness, title in _measure_thicknesses(store, skin):
         limits = (0.0, float(min(np.ceil(np.percentile(thickness, 99)), THICKEST_MM)))
-        shots = render_views(make_field_plotter(skin.copy(), thickness, limits, **MATT), views)
-        rows.append(PictureRow(shots, ("",) * 4, (limits, title)))
+        shots = pictures.render_views(
+            pictures.make_field_plotter(skin.copy(), thickness, limits, **pictures.MATT), views
+        )
+        rows.append(pictures.PictureRow(shots, ("",) * 4, (limits, title)))
     regions = [name for name in store.surface_files if name.startswith("region-")]
-    keys = [make_key("skin", SKIN_SURFACE), make_key("bone", BONE), make_key("proximal cut", CUT_PLANE)]
-    keys += [make_key(name.removeprefix("region-"), choose_inner_colour(name)) for name in regions]
-    return build_figure_sheet("Surfaces", rows, keys)
+    keys = [
+        pictures.make_key("skin", pictures.SKIN_SURFACE),
+        pictures.make_key("bone", pictures.BONE),
+        pictures.make_key("proximal cut", CUT_PLANE),
+    ]
+    keys += [
+        pictures.make_key(name.removeprefix("region-"), pictures.choose_inner_colour(name))
+        for name in regions
+    ]
+    return pictures.build_figure_sheet("Surfaces", rows, keys)
 
 
 def draw_sites_sheet(store: Results) -> Drawing:
@@ -75,26 +63,31 @@ def draw_sites_sheet(store: Results) -> Drawing:
     skin = pv.read(store.surface_files["skin"])
     regions = list(dict.fromkeys(row.region or "" for row in store.sites))
     colours = {name: REGIONS[i % len(REGIONS)] for i, name in enumerate(regions)}
-    plotter = make_limb_plotter(store, skin)
+    plotter = pictures.make_limb_plotter(store, skin)
     for row in store.sites:
-        axis, place = normalise(row.axis), np.array(row.position_mm)
+        axis, place = pictures.normalise(row.axis), np.array(row.position_mm)
         start = place - AXIS_MM * axis
         arrow = pv.Arrow(start=start, direction=axis, scale=AXIS_MM, tip_length=0.4, tip_radius=0.14)
-        plotter.add_mesh(arrow, color=colours[row.region or ""], **MATT)
+        plotter.add_mesh(arrow, color=colours[row.region or ""], **pictures.MATT)
 
-    def mark_facing(view: View) -> list[Mark]:
+    def mark_facing(view: pictures.View) -> list[pictures.Mark]:
         return [
-            Mark(row.site, np.array(row.position_mm), colours[row.region or ""], row.fitted)
+            pictures.Mark(row.site, np.array(row.position_mm), colours[row.region or ""], row.fitted)
             for row in store.sites
-            if normalise(row.axis) @ view.direction > 0.35
+            if pictures.normalise(row.axis) @ view.direction > 0.35
         ]
 
-    shots = render_views(plotter, make_four_views(store, skin), mark_facing)
-    keys = [make_key(name or "no region", colour, dot=True) for name, colour in colours.items()]
+    shots = pictures.render_views(plotter, pictures.make_four_views(store, skin), mark_facing)
+    keys = [pictures.make_key(name or "no region", colour, dot=True) for name, colour in colours.items()]
     used = {row.fitted for row in store.sites}
     if len(used) == 2:
-        keys += [make_key("fitted", "#555555", True), make_key("held out", "#555555", True, filled=False)]
-    return build_figure_sheet("Sites, with the axis of the indenter", [PictureRow(shots, SIDES)], keys)
+        keys += [
+            pictures.make_key("fitted", "#555555", True),
+            pictures.make_key("held out", "#555555", True, filled=False),
+        ]
+    return pictures.build_figure_sheet(
+        "Sites, with the axis of the indenter", [pictures.PictureRow(shots, pictures.SIDES)], keys
+    )
 
 
 def draw_mesh_sheet(store: Results) -> Drawing:
@@ -102,14 +95,17 @@ def draw_mesh_sheet(store: Results) -> Drawing:
     names = (store.fitted or store.site_names)[:MESHES]
     angles: dict[str, Any] = {}
     colours: dict[str, str] = {}
-    found = render_cut_meshes(store, names)
+    found = pictures.render_cut_meshes(store, names)
     for row, grid, *_ in found:
-        colours |= choose_region_colours(grid)
+        colours |= pictures.choose_region_colours(grid)
         tets = grid.cell_connectivity.reshape(-1, 4)
         angles[row.site] = compute_dihedral_angles(np.asarray(grid.points, float), tets).min(axis=1)
-    keys = [make_key(name, colour) for name, colour in (colours | {"wall of a bone": BONE}).items()]
+    keys = [
+        pictures.make_key(name, colour)
+        for name, colour in (colours | {"wall of a bone": pictures.BONE}).items()
+    ]
     title = "Meshes, cut along the limb through the site"
-    drawing = build_figure_sheet(title, make_mesh_rows(found), keys, spare_in=2.2)
+    drawing = pictures.build_figure_sheet(title, pictures.make_mesh_rows(found), keys, spare_in=2.2)
     _draw_histogram(drawing, angles)
     return drawing
 
@@ -127,7 +123,7 @@ def _draw_histogram(drawing: Drawing, angles: dict[str, Any]) -> None:
 
 def _make_cut_plane(store: Results, skin: Any) -> Any:
     assert store.surfaces is not None
-    normal, point = normalise(store.surfaces.cut_normal), np.array(store.surfaces.cut_point)
+    normal, point = pictures.normalise(store.surfaces.cut_normal), np.array(store.surfaces.cut_point)
     near = np.asarray(skin.points)[np.abs((skin.points - point) @ normal) < 3.0]
     centre = near.mean(axis=0) if len(near) else point
     reach = 1.12 * float(np.linalg.norm(near - centre, axis=1).max()) if len(near) else 60.0

@@ -64,7 +64,7 @@ def make_record_section(store: Results) -> Section:
         "records",
         draw_record_figure(store, chosen[0]) if chosen else None,
         draw_record_curves(store, tuple(dict.fromkeys(chosen))),
-        make_trace_table(store),
+        make_table("trace-facts", store.traces.items(), marked=lambda row: row[1].site in store.fitted),
     )
 
 
@@ -104,11 +104,6 @@ def _mark_phases(ax: Axes, phases: Sequence[RecordPhase]) -> None:
         if len(phases) <= MAX_NAMED_PHASES:
             text = ax.text((start + end) / 2, 0.02, phase.kind, transform=ax.get_xaxis_transform())
             text.set(color=MUTED, fontsize=6, ha="center", va="bottom", rotation=90)
-
-
-def make_trace_table(store: Results) -> Table | None:
-    """Touch-down, peak, noise and phases of every record."""
-    return make_table("trace-facts", store.traces.items(), marked=lambda row: row[1].site in store.fitted)
 
 
 def make_record_check_section(store: Results) -> Section:

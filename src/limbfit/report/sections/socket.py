@@ -243,7 +243,7 @@ def draw_measured_figure(content: stored.SocketResult) -> Figure | None:
         title = f"{one.name}, {one.load}: {key.removesuffix('_kPa')}"
         ax.set(title=title, xlabel="Around the limb (°)", ylabel="Level (mm)")
     drawing.colorbar(axes[0].collections[0], ax=axes, label="Pressure (kPa)", fraction=0.03)
-    add_legend(drawing, max(axes, key=lambda ax: len(ax.get_legend_handles_labels()[1])))
+    add_legend(drawing, *axes)
     return make_figure(drawing, "socket-measured-maps")
 
 

@@ -10,7 +10,8 @@ from matplotlib.ticker import MaxNLocator
 
 from ...results import uncertainty as stored
 from ..drawing import plots
-from ..drawing.colours import HELD_OUT, INK, MEASURED, MUTED, ONE_MATERIAL, SIMULATED
+from ..drawing.colours import HELD_OUT, INK, MUTED, ONE_MATERIAL, SIMULATED
+from ..drawing.figures import draw_forces
 from ..formats import format_fixed, format_parameter, format_with_unit
 from ..page import Bullets, Figure, Note, Prose, Section, Table, make_bullets
 from ..store import Curves, Results, find_compared_quantity
@@ -155,21 +156,11 @@ def draw_prediction_figure(store: Results, content: stored.UncertaintyResult) ->
     drawing, axes = plots.make_panels(len(pairs), 3, 2.0)
     plots.label_outer(axes, 3, "Time (s)", "Force (N)")
     for ax, (row, curves) in zip(axes, pairs, strict=True):
-        time = curves["time_s"]
-        quantity, unit = find_compared_quantity(curves)
-        kinds = ("low", "high", "measured", "predicted")
-        low, high, measured, predicted = (curves[f"{quantity}_{kind}_{unit}"] for kind in kinds)
-        plots.plot_band(ax, time, low, high)
-        ax.plot(time, measured, color=MEASURED, lw=2.2, alpha=0.55, label="measured")
-        ax.plot(time, predicted, color=SIMULATED, lw=1.1, label="predicted")
+        draw_forces(ax, curves, "time_s", "predicted", "predicted")
+        ax.axhline(0, color=MUTED, lw=0.6)
         kind = "fitted" if row.fitted else "held out"
         ax.set_title(f"site {row.record}, {kind}: {format_fixed(row.inside_percent, 0)} % inside")
-        ax.margins(x=0.01)
-        if quantity != "force":
-            ax.set_ylabel(f"{quantity.capitalize()} ({unit})")
     plots.add_legend(drawing, axes[0])
-    for ax in axes:
-        ax.axhline(0, color=MUTED, lw=0.6)
     return plots.make_figure(drawing, "predictions", records=[row.record for row, _ in pairs])
 
 
