@@ -11,7 +11,8 @@ import limbfit
 
 from ..bench import LARGE_UNKNOWNS, UNKNOWNS
 from ..execution import count_usable_cores
-from .console import STDOUT, AsJson, Column, Show, listen_on_console, print_line, print_result, print_table
+from . import console
+from .console import AsJson, Column
 
 app = Typer(help="Benchmarks of solver, meshes, identification.", no_args_is_help=True, rich_markup_mode=None)
 
@@ -21,15 +22,17 @@ BesideFebio = Annotated[bool, Option("--beside-febio", help="run FEBio itself af
 CORES = count_usable_cores()
 
 
-def _bench(name: str, run: Callable[..., Any], arguments: tuple[Any, ...], show: Show, as_json: bool) -> None:
+def _bench(
+    name: str, run: Callable[..., Any], arguments: tuple[Any, ...], show: console.Show, as_json: bool
+) -> None:
     """Run a benchmark, show how far it is, and print what it found."""
-    with listen_on_console() as listener:
+    with console.listen_on_console() as listener:
 
         def tell(done: int, total: int, text: str) -> None:
             listener(limbfit.Progress(name, done, total, text))
 
         result = run(*arguments, tell=tell)
-    print_result(result, show, as_json)
+    console.print_result(result, show, as_json)
 
 
 @app.command()
@@ -48,7 +51,7 @@ def show_parity(rows: list[dict[str, Any]]) -> None:
         "FEBio's peak": lambda row: format_peak(row, "febio_peak_"),
         "what explains it": "note",
     }
-    print_table(rows, columns)
+    console.print_table(rows, columns)
 
 
 def format_peak(row: Mapping[str, Any], start: str) -> str:
@@ -99,8 +102,8 @@ def scaling(
 def show_scaling(result: dict[str, Any]) -> None:
     columns: dict[str, Column] = {key: key for key in ("element", "cells", "unknowns", "steps")}
     columns |= {"seconds": ("seconds", ".1f"), "memory (MB)": ("max_rss_MB", ".0f")}
-    print_table((*result["sizes"], result["paper_sized"]), columns)
-    print_line(f"seconds grow as unknowns^{result['seconds_exponent']:.2f}")
+    console.print_table((*result["sizes"], result["paper_sized"]), columns)
+    console.print_line(f"seconds grow as unknowns^{result['seconds_exponent']:.2f}")
 
 
 @app.command()
@@ -117,7 +120,7 @@ def meshing(
 def show_meshing(result: dict[str, Any]) -> None:
     show_facts({key: value for key, value in result.items() if key != "limbs"})
     for name, facts in result["limbs"].items():
-        print_line(name)
+        console.print_line(name)
         show_facts(facts)
 
 
@@ -131,9 +134,8 @@ def calibrate(
 
     With --beside-febio: beside FEBio's loop of finite differences, extrapolated from one run of FEBio.
     """
-    with listen_on_console() as listener:
-        result = limbfit.bench_calibrate(study, beside_febio=beside_febio, listener=listener)
-    print_result(result, show_facts, as_json)
+    result = console.call_with_progress(limbfit.bench_calibrate, study, beside_febio=beside_febio)
+    console.print_result(result, show_facts, as_json)
 
 
 def show_facts(facts: dict[str, Any]) -> None:
@@ -142,4 +144,4 @@ def show_facts(facts: dict[str, Any]) -> None:
         rows = {f"{key}: {part}": v for part, v in value.items()} if isinstance(value, dict) else {key: value}
         for name, entry in rows.items():
             table.add_row(name, f"{entry:.4g}" if isinstance(entry, float) else str(entry))
-    STDOUT.print(table)
+    console.STDOUT.print(table)

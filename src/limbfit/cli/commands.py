@@ -14,21 +14,8 @@ from ..errors import InputError
 from ..results.limb import MeshMeasures
 from ..results.study_results import StudyResults
 from ..study import Study
-from .console import (
-    AsJson,
-    Column,
-    build_parameter_columns,
-    fail,
-    format_use,
-    listen_on_console,
-    parse_numbers,
-    print_json,
-    print_line,
-    print_result,
-    print_table,
-    print_warning,
-    print_warnings,
-)
+from . import console
+from .console import AsJson, Column
 
 StudyPath = Annotated[Path, Argument(help="study.toml, or the folder that holds it", show_default=False)]
 Parameters = Annotated[
@@ -50,8 +37,7 @@ def call_on_study(study: Path, function: Callable[..., Any], *arguments: Any, **
     checked = limbfit.load_study(study)
     if "parameters" in options:
         options["parameters"] = parse_parameters(options["parameters"], checked)
-    with listen_on_console() as listener:
-        return function(checked, *arguments, listener=listener, **options)
+    return console.call_with_progress(function, checked, *arguments, **options)
 
 
 def demo(
@@ -64,12 +50,11 @@ def demo(
     The patient of seed 0 comes with limbfit; those of other seeds are made first.
     """
     start = perf_counter()
-    with listen_on_console() as listener:
-        summary = limbfit.run_demo(folder, seed=seed, listener=listener)
+    summary = console.call_with_progress(limbfit.run_demo, folder, seed=seed)
     summary["seconds"] = round(perf_counter() - start, 1)
-    print_result(summary, show_summary, as_json)
+    console.print_result(summary, show_summary, as_json)
     if not as_json:
-        print_line(
+        console.print_line(
             f"next: limbfit studio {folder} shows it all in a browser; limbfit uncertainty {folder} finds "
             f"what the records determine; {folder / 'study.toml'} is an example of a study file"
         )
@@ -90,25 +75,14 @@ def phantom(
     as_json: AsJson = False,
 ) -> None:
     """Make a synthetic patient with known truth: MRI as DICOM, traces, study.toml, truth.json."""
-    with listen_on_console() as listener:
-        truth = limbfit.make_phantom_study(
-            folder,
-            detail=detail,
-            seed=seed,
-            fat=fat,
-            socket=socket,
-            sensors=sensors,
-            ultrasound=ultrasound,
-            surface=surface,
-            shear_waves=shear_waves,
-            tendon=tendon,
-            limb=limb,
-            listener=listener,
-        )
+    tissues: dict[str, Any] = {"fat": fat, "tendon": tendon}
+    measured = {"ultrasound": ultrasound, "surface": surface, "shear_waves": shear_waves}
+    options = {"detail": detail, "seed": seed, "limb": limb, "socket": socket, "sensors": sensors}
+    truth = console.call_with_progress(limbfit.make_phantom_study, folder, **options, **tissues, **measured)
     if as_json:
-        print_json({"study": str(folder / "study.toml"), **truth})
+        console.print_json({"study": str(folder / "study.toml"), **truth})
     else:
-        print_line(f"synthetic patient in {folder}; next: limbfit run {folder}")
+        console.print_line(f"synthetic patient in {folder}; next: limbfit run {folder}")
 
 
 def series(
@@ -116,7 +90,7 @@ def series(
     as_json: AsJson = False,
 ) -> None:
     """List the DICOM series of a folder, to choose one by its UID (image.series in study.toml)."""
-    print_result({"series": limbfit.describe_series(folder)}, show_series, as_json)
+    console.print_result({"series": limbfit.describe_series(folder)}, show_series, as_json)
 
 
 def show_series(result: dict[str, Any]) -> None:
@@ -125,23 +99,23 @@ def show_series(result: dict[str, Any]) -> None:
         size = f"{row['slices']} slices of {row['rows']} x {row['columns']}"
         step = " x ".join(f"{s:.4g}" for s in row["spacing_mm"]) + " mm, whole" if row["whole"] else ""
         state = step or f"no volume: {row['why_not']}"
-        print_line(f"{number}{row['modality'] or '?'}, {size}, {state}\n  {row['uid']}")
+        console.print_line(f"{number}{row['modality'] or '?'}, {size}, {state}\n  {row['uid']}")
 
 
 def check(study: StudyPath, as_json: AsJson = False) -> None:
     """Read every input of a study and report what is wrong, before anything runs."""
-    print_result(call_on_study(study, limbfit.check_study), show_findings, as_json)
+    console.print_result(call_on_study(study, limbfit.check_study), show_findings, as_json)
 
 
 def show_findings(findings: dict[str, Any]) -> None:
     for line in findings["facts"]:
-        print_line(line)
-    print_warnings(flag["text"] for flag in findings["flags"])
-    print_warnings(findings["outside_text"])
+        console.print_line(line)
+    console.print_warnings(flag["text"] for flag in findings["flags"])
+    console.print_warnings(findings["outside_text"])
     if any("run" in row["commands"] for row in findings["refused"]):
-        print_line("the study cannot be run to its end")
+        console.print_line("the study cannot be run to its end")
     else:
-        print_line("the study can be run" + (", but see the warnings" if findings["flags"] else ""))
+        console.print_line("the study can be run" + (", but see the warnings" if findings["flags"] else ""))
 
 
 def run(
@@ -155,12 +129,12 @@ def run(
     began = perf_counter()
     summary = call_on_study(study, limbfit.run_study, until=until, start=start, force=force or ())
     summary["seconds"] = round(perf_counter() - began, 1)
-    print_result(summary, show_summary, as_json)
+    console.print_result(summary, show_summary, as_json)
 
 
 def status(study: StudyPath, as_json: AsJson = False) -> None:
     """List the stages that are done, begun, stale (and why) or missing."""
-    print_result({"stages": limbfit.study_status(limbfit.load_study(study))}, show_states, as_json)
+    console.print_result({"stages": limbfit.study_status(limbfit.load_study(study))}, show_states, as_json)
 
 
 def show_states(result: dict[str, Any]) -> None:
@@ -170,10 +144,10 @@ def show_states(result: dict[str, Any]) -> None:
         "seconds": ("seconds", ".1f"),
         "finished": "finished",
     }
-    print_table(result["stages"], columns, dash="")
+    console.print_table(result["stages"], columns, dash="")
     for row in result["stages"]:
         if row["why"]:
-            print_line(f"{row['stage']} is stale: {'; '.join(row['why'])}")
+            console.print_line(f"{row['stage']} is stale: {'; '.join(row['why'])}")
 
 
 def simulate(
@@ -188,10 +162,10 @@ def simulate(
     options = {"parameters": parameters, "animation": animation, "solver": solver}
     result = call_on_study(study, limbfit.simulate_site, site, **options)
     if as_json:
-        print_json(result)
+        console.print_json(result)
     else:
         deep = result["penetration_mm"]
-        print_line(
+        console.print_line(
             f"site {site}: peak force {result['peak_force_N']:.3f} N at {result['depth_mm']:.2f} mm, "
             + (f"penetration {deep:.3f} mm, " if deep is not None else f"{result['solver']}, ")
             + f"{result['element']}, {result['unknowns']} unknowns\n"
@@ -199,21 +173,21 @@ def simulate(
             f"curve: {result['curve']}\nfields: {result['fields']}"
         )
     show_warnings([result])
-    print_warnings(result["outside_text"])
+    console.print_warnings(result["outside_text"])
     if not result["completed"]:
-        fail(f"site {site}: the simulation is partial: {result['reason']}", 1)
+        console.fail(f"site {site}: the simulation is partial: {result['reason']}", 1)
 
 
 def report(study: StudyPath, as_json: AsJson = False) -> None:
     """Make the report again from stored results; nothing is solved."""
-    print_result(call_on_study(study, limbfit.report_study), show_summary, as_json)
+    console.print_result(call_on_study(study, limbfit.report_study), show_summary, as_json)
 
 
 def parse_parameters(text: str | None, study: Study) -> dict[str, dict[str, float]] | None:
     """``--parameters``: the numbers of each tissue, in the order of the study's tissues."""
     if text is None:
         return None
-    values = parse_numbers(text, 0.0, sys.float_info.max)
+    values = console.parse_numbers(text, 0.0, sys.float_info.max)
     if len(values) != len(study.parameters):
         what = f"{text!r} is not {len(study.parameters)} numbers"
         remedy = f"give {','.join(study.law.keys)} of {', then of '.join(study.tissues)}, separated by commas"
@@ -225,22 +199,22 @@ def show_summary(summary: dict[str, Any]) -> None:
     if "parameters" in summary:
         show_parameters(summary)
     elif "until" in summary:
-        print_line(f"done until {summary['until']}; results in {summary['results']}")
+        console.print_line(f"done until {summary['until']}; results in {summary['results']}")
         return
     if "sites" in summary:  # as the report, not before its stage
         show_sites(summary)
         show_warnings(summary["sites"])
-        print_warnings(summary["outside_text"])
-    print_warnings(flag["text"] for flag in summary.get("flags", ()))
+        console.print_warnings(summary["outside_text"])
+    console.print_warnings(flag["text"] for flag in summary.get("flags", ()))
     if "report" in summary:
-        print_line(f"report: {summary['report']}")
+        console.print_line(f"report: {summary['report']}")
 
 
 def show_warnings(sites: Sequence[Mapping[str, Any]]) -> None:
     """What is doubtful about the simulations of the sites."""
     for site in sites:
         for text in site["warnings"]:
-            print_warning(f"site {site.get('record', site['site'])}: {text}")
+            console.print_warning(f"site {site.get('record', site['site'])}: {text}")
 
 
 def show_parameters(summary: dict[str, Any]) -> None:
@@ -250,25 +224,25 @@ def show_parameters(summary: dict[str, Any]) -> None:
         for kind, tissues in (("identified", summary["parameters"]), ("truth", summary.get("truth", {})))
         for tissue, values in tissues.items()
     ]
-    print_table(rows, {"tissue": "tissue", **build_parameter_columns(keys)})
+    console.print_table(rows, {"tissue": "tissue", **console.build_parameter_columns(keys)})
     for text in summary.get("relaxation", {}).get("words", ()):
-        print_line(f"relaxation: {text}")
+        console.print_line(f"relaxation: {text}")
 
 
 def show_sites(summary: dict[str, Any]) -> None:
     columns: dict[str, Column] = {
         "site": "record",
         "region": "region",
-        "used": format_use,
+        "used": console.format_use,
         "peak force (N)": ("peak_force_N", ".2f"),
         "error (%)": ("error_percent", ".2f"),
     }
-    print_table(summary["sites"], columns)
+    console.print_table(summary["sites"], columns)
     for kind, key in (("fitted", "mean_error_fitted_percent"), ("held-out", "mean_error_heldout_percent")):
         if summary.get(key) is not None:
-            print_line(f"mean error at the {kind} sites: {summary[key]:.2f} %")
+            console.print_line(f"mean error at the {kind} sites: {summary[key]:.2f} %")
     if summary.get("fit_quality"):
-        print_line(f"fit: {summary['fit_quality']}")
+        console.print_line(f"fit: {summary['fit_quality']}")
 
 
 def segment(study: StudyPath, as_json: AsJson = False) -> None:
@@ -297,27 +271,29 @@ def _run_until(
     """Run the study until a stage, print what it made and where its picture is."""
     result = call_on_study(study, limbfit.show_stage, stage)
     if as_json:
-        print_json(result)
+        console.print_json(result)
         return
     show(limbfit.load_results(limbfit.load_study(study)), result)
     if result["picture"]:
-        print_line(f"picture: {result['picture']}")
+        console.print_line(f"picture: {result['picture']}")
 
 
 def show_labels(results: StudyResults, facts: dict[str, Any]) -> None:
     found = results.segment
     volumes = ", ".join(f"{name} {value:.1f}" for name, value in found.volumes_cm3.items())
-    print_line(f"{found.method}; volumes in cm3: {volumes}")
+    console.print_line(f"{found.method}; volumes in cm3: {volumes}")
     for repair in found.repairs:
-        print_line(f"repaired: {repair}")
+        console.print_line(f"repaired: {repair}")
     for warning in found.warnings:
-        print_line(f"warning: {warning}")
+        console.print_line(f"warning: {warning}")
     if found.markers_removed is not None:
-        print_line(f"markers taken off the skin: {found.markers_removed}")
+        console.print_line(f"markers taken off the skin: {found.markers_removed}")
     if motion := found.motion:
         moved = f"{motion.shift_mm:.1f} mm and {motion.turn_deg:.1f} degrees"
-        print_line(f"between the images the limb moved by {moved} (correlation {motion.correlation:.2f})")
-    print_line(f"labels: {facts['labels']}")
+        console.print_line(
+            f"between the images the limb moved by {moved} (correlation {motion.correlation:.2f})"
+        )
+    console.print_line(f"labels: {facts['labels']}")
 
 
 def show_surfaces(results: StudyResults, result: dict[str, Any]) -> None:
@@ -332,24 +308,26 @@ def show_surfaces(results: StudyResults, result: dict[str, Any]) -> None:
         "thinnest tissue (mm)": ("tissue_mm", ".1f"),
         "at (LPS mm)": lambda row: format_point(row["at"]) if "at" in row else "",
     }
-    print_table(rows, columns, dash="", unwrapped=columns)
-    print_line(f"{result['closed_bodies']} closed bodies; cut through {format_point(result['cut_point'])}")
+    console.print_table(rows, columns, dash="", unwrapped=columns)
+    console.print_line(
+        f"{result['closed_bodies']} closed bodies; cut through {format_point(result['cut_point'])}"
+    )
     if result["amputation"]:
         ends = (f"{name} {end:.1f}" for name, end in result["amputation"]["beyond_plane_mm"].items())
-        print_line(f"amputated; ends beyond the plane (mm): {', '.join(ends)}")
+        console.print_line(f"amputated; ends beyond the plane (mm): {', '.join(ends)}")
 
 
 def show_placed_sites(results: StudyResults, facts: dict[str, Any]) -> None:
     columns: dict[str, Column] = {
         "site": "site",
         "region": "region",
-        "used": format_use,
+        "used": console.format_use,
         "at (LPS mm)": lambda row: format_point(row.position_mm),
         "off skin": lambda row: f"{row.off_skin_mm:.2f} mm",
         "marker": lambda row: f"{row.marker.height_mm:.1f} mm" if row.marker else "",
         "from 'near'": lambda row: f"{row.marker.distance_to_hint_mm:.1f} mm" if row.marker else "",
     }
-    print_table(results.sites.sites, columns, unwrapped=columns.keys() - {"region"})
+    console.print_table(results.sites.sites, columns, unwrapped=columns.keys() - {"region"})
 
 
 def show_meshes(results: StudyResults, facts: dict[str, Any]) -> None:
@@ -366,10 +344,10 @@ def show_meshes(results: StudyResults, facts: dict[str, Any]) -> None:
         "trimmed bone (cm3)": format_trimmed,
     }
     meshes = results.mesh.sites
-    print_table(meshes.items(), columns, unwrapped=columns.keys() - {"trimmed bone (cm3)"})
+    console.print_table(meshes.items(), columns, unwrapped=columns.keys() - {"trimmed bone (cm3)"})
     for name, mesh in meshes.items():
         for warning in mesh.warnings:
-            print_line(f"warning: site {name}: {warning}")
+            console.print_line(f"warning: site {name}: {warning}")
 
 
 def format_point(position: Sequence[float]) -> str:
@@ -378,7 +356,7 @@ def format_point(position: Sequence[float]) -> str:
 
 def schema(result: Annotated[str, Argument(help="name of the result, such as predict")]) -> None:
     """Print the JSON schema of a stored result: its keys, their types and what they mean."""
-    print_json(limbfit.build_schema(result))
+    console.print_json(limbfit.build_schema(result))
 
 
 VERBS = (demo, phantom, series, check, run, status, simulate, report, schema, segment, surfaces, sites, mesh)

@@ -121,6 +121,12 @@ def listen_on_console() -> Iterator[Callable[[limbfit.Progress], None]]:
         fail(INTERRUPTED, 130)
 
 
+def call_with_progress(function: Callable[..., Any], *arguments: Any, **options: Any) -> Any:
+    """Call a function of the library, and show its progress."""
+    with listen_on_console() as listener:
+        return function(*arguments, listener=listener, **options)
+
+
 @contextmanager
 def _draw_bars() -> Iterator[Callable[[limbfit.Progress], None]]:
     columns = (

@@ -14,29 +14,15 @@ from ..errors import InputError
 from ..results.planning import DesignResult, ProtocolResult
 from ..results.uncertainty import CrossvalidateResult, ModelsResult, RegionsResult, UncertaintyResult
 from ..results.variants import CubeResult, RefinementResult, VolumeResult
+from . import console
 from .commands import Parameters, StudyPath, call_on_study
-from .console import (
-    AsJson,
-    Column,
-    Show,
-    build_parameter_columns,
-    format_ends,
-    format_use,
-    listen_on_console,
-    parse_numbers,
-    print_json,
-    print_line,
-    print_stored,
-    print_table,
-    print_warning,
-    refuse_idle_options,
-)
+from .console import AsJson, Column
 
 
-def _run_and_print(study: Path, name: str, show: Show, as_json: bool, **options: Any) -> None:
+def _run_and_print(study: Path, name: str, show: console.Show, as_json: bool, **options: Any) -> None:
     """Do the experiment ``name`` with ``options``, print what it found and where it is stored."""
     result = call_on_study(study, limbfit.run_experiment, name, **options)
-    print_stored(result, name, show, as_json)
+    console.print_stored(result, name, show, as_json)
 
 
 def cube(
@@ -54,10 +40,10 @@ def cube(
     folder = output or Path("cube")
     result = limbfit.compress_cube(folder, compression_percent=compression)
     if as_json:
-        print_json(result | {"folder": str(folder)})
+        console.print_json(result | {"folder": str(folder)})
         return
     show_cube(CubeResult.model_validate(result))
-    print_line(f"stored in {folder}: cube.json, cube.csv, cube.svg")
+    console.print_line(f"stored in {folder}: cube.json, cube.csv, cube.svg")
 
 
 def show_cube(found: CubeResult) -> None:
@@ -67,7 +53,7 @@ def show_cube(found: CubeResult) -> None:
         "back (kPa)": ("back_kPa", ".2f"),
         "least J": ("J_min", ".4f"),
     }
-    print_table(found.tissues, columns, unwrapped=("tissue",))
+    console.print_table(found.tissues, columns, unwrapped=("tissue",))
 
 
 def regions(
@@ -96,17 +82,17 @@ def show_regions(found: RegionsResult) -> None:
         "region": "region",
         "sites": "sites",
         "tissue": "tissue",
-        **build_parameter_columns(keys),
+        **console.build_parameter_columns(keys),
         "error (%)": ("own", ".2f"),
         "whole (%)": ("whole", ".2f"),
     }
-    print_table(rows, columns, dash="")
+    console.print_table(rows, columns, dash="")
     _show_left_out(found.left_out)
 
 
 def _show_left_out(texts: Iterable[str]) -> None:
     for text in texts:
-        print_line(f"left out: {text}")
+        console.print_line(f"left out: {text}")
 
 
 def uncertainty(
@@ -127,7 +113,7 @@ def uncertainty(
         return
     names = [name.strip() for name in models.split(",") if name.strip()]
     result = call_on_study(study, limbfit.compare_models, names)
-    print_stored(result, "models", show_models, as_json)
+    console.print_stored(result, "models", show_models, as_json)
 
 
 def show_models(found: ModelsResult) -> None:
@@ -139,15 +125,15 @@ def show_models(found: ModelsResult) -> None:
         "2 ln B against the study's": ("evidence", "+.1f"),
         "weight (%)": lambda row: f"{100 * row.weight:.0f}",
     }
-    print_table(found.models, columns, dash="")
+    console.print_table(found.models, columns, dash="")
     columns = {
         "record": "record",
-        "": format_use,
+        "": console.format_use,
         "measured peak": lambda row: f"{row.peak:.3g} {row.unit}",
-        "95 % by the study's model": lambda row: f"{format_ends(row.own_interval_95)} {row.unit}",
-        "95 % by all models": lambda row: f"{format_ends(row.interval_95)} {row.unit}",
+        "95 % by the study's model": lambda row: f"{console.format_ends(row.own_interval_95)} {row.unit}",
+        "95 % by all models": lambda row: f"{console.format_ends(row.interval_95)} {row.unit}",
     }
-    print_table(found.records, columns)
+    console.print_table(found.records, columns)
     _show_left_out(found.left_out.values())
 
 
@@ -155,13 +141,13 @@ def show_uncertainty(found: UncertaintyResult) -> None:
     columns: dict[str, Column] = {
         "parameter": "name",
         "identified": ("calibrated", ".3g"),
-        "95 % by the records": lambda row: format_ends(row.posterior_95),
-        "95 % with all sources": lambda row: format_ends(row.with_sources_95),
+        "95 % by the records": lambda row: console.format_ends(row.posterior_95),
+        "95 % with all sources": lambda row: console.format_ends(row.with_sources_95),
         "verdict": "verdict",
     }
-    print_table(found.parameters, columns)
+    console.print_table(found.parameters, columns)
     for text in found.verdict:
-        print_line(text)
+        console.print_line(text)
 
 
 SENSITIVITIES = ("c", "kappa", "contact", "indenter", "mesh")
@@ -179,9 +165,9 @@ def sensitivity(
         result = call_on_study(study, limbfit.run_experiment, f"sensitivity-{name}", sites=site or [])
         results[name] = result
         if not as_json:
-            print_stored(result, f"sensitivity_{name}", partial(show_sensitivity, name), False)
+            console.print_stored(result, f"sensitivity_{name}", partial(show_sensitivity, name), False)
     if as_json:
-        print_json(results)
+        console.print_json(results)
 
 
 def parse_sensitivities(only: str | None) -> list[str]:
@@ -204,16 +190,16 @@ def show_sensitivity(name: str, found: Any) -> None:
     }
     if isinstance(found, VolumeResult):
         columns |= {"least J": ("J_min", ".4f"), "largest J": ("J_max", ".4f")}
-    print_table(found.runs, columns)
+    console.print_table(found.runs, columns)
     for row in found.sites if isinstance(found, RefinementResult) else ():
         if row.limit_N is not None:
             text = f"{row.limit_N:.3f} N on the finest mesh, from which nothing can be extrapolated"
             if row.order:
                 text = f"tends to {row.limit_N:.3f} N, order {row.order:.2g}"
-            print_line(f"site {row.site}: {text}; the study's mesh is {row.error_percent:+.2f} % off")
+            console.print_line(f"site {row.site}: {text}; the study's mesh is {row.error_percent:+.2f} % off")
     for row in found.runs:
         if not row.completed:
-            print_warning(f"partial: site {row.site}, {row.label}: {row.reason}")
+            console.print_warning(f"partial: site {row.site}, {row.label}: {row.reason}")
 
 
 def experiment(
@@ -224,11 +210,10 @@ def experiment(
 ) -> None:
     """Run an experiment that has no command of its own."""
     checked, options = limbfit.load_study(study), parse_options(option or ())
-    with listen_on_console() as listener:
-        result = limbfit.run_experiment(checked, name, listener=listener, **options)
-    print_json(result)
+    result = console.call_with_progress(limbfit.run_experiment, checked, name, **options)
+    console.print_json(result)
     if not as_json:
-        print_line(f"stored in {result['folder']}; limbfit report shows it")
+        console.print_line(f"stored in {result['folder']}; limbfit report shows it")
 
 
 def parse_options(words: Iterable[str]) -> dict[str, Any]:
@@ -262,18 +247,20 @@ def show_crossvalidation(found: CrossvalidateResult) -> None:
     own, checks = found.own, found.emulator.checks
     choices = f"{found.choices} of {found.choices_possible} choices of {found.fitted_sites} sites"
     quantiles = f"median; 5 to 95 %: {own.low_percent:.2f} to {own.high_percent:.2f} %"
-    print_line(f"{choices}: mean held-out error {own.median_percent:.2f} % ({quantiles})")
+    console.print_line(f"{choices}: mean held-out error {own.median_percent:.2f} % ({quantiles})")
     if own.share_better is not None:  # the study's own choice leaves sites to be predicted
         error = f"the study's own choice ({', '.join(own.fitted)}): {own.mean_error_heldout_percent:.2f} %"
-        print_line(f"{error}; {100 * own.share_better:.0f} % of the choices do better")
+        console.print_line(f"{error}; {100 * own.share_better:.0f} % of the choices do better")
     known = [row for row in found.sites if row.mean_percent is not None]
     rows = [{"name": f"site {row.site}", "error": row.mean_percent} for row in known]
     for fit in found.regions:
         rows.append({"name": f"region {fit.label}", "error": fit.mean_error_heldout_percent})
-    print_table(rows, {"left out": "name", "error (%)": ("error", ".2f")})
+    console.print_table(rows, {"left out": "name", "error (%)": ("error", ".2f")})
     if checks:
         largest = max(row.emulator_error_percent for row in checks)
-        print_line(f"the emulator at {len(checks)} of the fits, against the solver: within {largest:.2f} %")
+        console.print_line(
+            f"the emulator at {len(checks)} of the fits, against the solver: within {largest:.2f} %"
+        )
 
 
 def _session_option(help: str, **limits: Any) -> Any:
@@ -317,11 +304,11 @@ def design(
         "shear-waves": shear_waves,
     }
     if not protocol:
-        refuse_idle_options(of_session, "without --protocol")
+        console.refuse_idle_options(of_session, "without --protocol")
         result = call_on_study(study, limbfit.design_study, sites=sites or 0, **options)
-        print_stored(result, "design", show_design, as_json)
+        console.print_stored(result, "design", show_design, as_json)
         return
-    refuse_idle_options({"sites": sites}, "with --protocol")
+    console.refuse_idle_options({"sites": sites}, "with --protocol")
     result = call_on_study(
         study,
         limbfit.plan_protocol,
@@ -336,14 +323,14 @@ def design(
         shear_waves_sd_m_s=shear_waves,
         **options,
     )
-    print_stored(result, "protocol", show_protocol, as_json)
+    console.print_stored(result, "protocol", show_protocol, as_json)
 
 
 def parse_list(text: str | None, place: str, remedy: str, least: float = 1e-3) -> tuple[float, ...]:
     """Numbers with commas between them, from ``least`` to 600; none where nothing is given."""
     if text is None:
         return ()
-    values = parse_numbers(text, least, 600.0)
+    values = console.parse_numbers(text, least, 600.0)
     if not values:
         raise InputError(f"{text!r} will not do", place=place, remedy=remedy)
     return tuple(values)
@@ -356,7 +343,7 @@ def show_design(found: DesignResult) -> None:
         "D (%)": lambda row: f"{100 * row.d_efficiency:.0f}",
         "A (%)": lambda row: f"{100 * row.a_efficiency:.0f}",
     }
-    print_table(found.designs, columns)
+    console.print_table(found.designs, columns)
     _show_expected({one.design: one.factor_95 for one in found.designs}, found.verdict)
     _show_left_out(found.left_out)
 
@@ -371,7 +358,7 @@ def show_protocol(found: ProtocolResult) -> None:
         "hold (s)": ("hold_s", ".3g"),
         "force (N)": ("peak_force_N", ".3g"),
     }
-    print_table(found.records, columns)
+    console.print_table(found.records, columns)
     expected = {one.design: {**one.factor_95, **one.pressures_95} for one in found.protocols}
     _show_expected(expected, found.verdict)
     _show_left_out(found.left_out)
@@ -383,8 +370,8 @@ def _show_expected(choices: Mapping[str, Mapping[str, float]], verdict: str) -> 
         {"parameter": name, **{choice: f"x/ {min(of[name], 999):.3g}" for choice, of in choices.items()}}
         for name in next(iter(choices.values()))
     ]
-    print_table(rows, {head: head for head in ("parameter", *choices)})
-    print_line(verdict)
+    console.print_table(rows, {head: head for head in ("parameter", *choices)})
+    console.print_line(verdict)
 
 
 VERBS = (cube, regions, sensitivity, uncertainty, experiment, crossvalidate, design)

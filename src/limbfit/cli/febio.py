@@ -8,7 +8,7 @@ from typer import Argument, Option
 import limbfit
 
 from .commands import Parameters, StudyPath, call_on_study
-from .console import AsJson, fail, listen_on_console, print_aside, print_json, print_line, print_warnings
+from .console import AsJson, call_with_progress, fail, print_aside, print_json, print_line, print_warnings
 
 
 def febio(
@@ -18,8 +18,7 @@ def febio(
     as_json: AsJson = False,
 ) -> None:
     """Solve a FEBio input with limbfit's solver, and write the log-file tables that it asks for."""
-    with listen_on_console() as listener:
-        result = limbfit.simulate_feb(file, output, threads=threads, listener=listener)
+    result = call_with_progress(limbfit.simulate_feb, file, output, threads=threads)
     if as_json:
         print_json(result)
     else:

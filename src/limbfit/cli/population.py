@@ -9,16 +9,8 @@ import limbfit
 
 from ..errors import InputError
 from ..results.population import WORST_PLACE, PopulationResult
-from .console import (
-    AsJson,
-    Column,
-    format_ends,
-    listen_on_console,
-    print_line,
-    print_result,
-    print_table,
-    print_warnings,
-)
+from . import console
+from .console import AsJson, Column
 from .runs import add_execution_options
 
 app = typer.Typer(
@@ -44,7 +36,7 @@ def init(
     """Write a population.toml with its keys explained."""
     if phantom + (model is not None) + (limbs is not None) > 1:
         raise InputError("give one of --phantom, --model and --limbs", place="--phantom")
-    print_line(f"written to {limbfit.write_trial(folder, model=model, limbs=limbs)}")
+    console.print_line(f"written to {limbfit.write_trial(folder, model=model, limbs=limbs)}")
 
 
 @app.command()
@@ -53,9 +45,9 @@ def check(trial: TrialPath, as_json: AsJson = False) -> None:
 
     def show(found: dict[str, Any]) -> None:
         inputs = ", ".join(f"{name} {value:.3g}" for name, value in found["inputs"].items())
-        print_line(f"person {found['person']} can wear every socket: {inputs}")
+        console.print_line(f"person {found['person']} can wear every socket: {inputs}")
 
-    print_result(limbfit.check_trial(trial), show, as_json)
+    console.print_result(limbfit.check_trial(trial), show, as_json)
 
 
 def run(
@@ -68,9 +60,8 @@ def run(
     as_json: AsJson = False,
 ) -> None:
     """Simulate the people, and write answers and report; go on where a run was ended."""
-    with listen_on_console() as listener:
-        found = limbfit.run_population(trial, people=people, within_percent=within, listener=listener)
-    print_result(found, _show_stored, as_json)
+    found = console.call_with_progress(limbfit.run_population, trial, people=people, within_percent=within)
+    console.print_result(found, _show_stored, as_json)
 
 
 @app.command()
@@ -80,18 +71,18 @@ def status(trial: TrialPath, as_json: AsJson = False) -> None:
     def show(found: dict[str, Any]) -> None:
         seconds = found["seconds_per_socket"]
         time = "" if seconds is None else f", {seconds:.0f} s a socket"
-        print_line(
+        console.print_line(
             f"{found['people']} of {found['wanted']} people wear every socket{time}; {found['failed']} "
             f"simulations failed, {found['rejected']} limbs were rejected"
         )
 
-    print_result(limbfit.count_people(trial), show, as_json)
+    console.print_result(limbfit.count_people(trial), show, as_json)
 
 
 @app.command()
 def report(trial: TrialPath, as_json: AsJson = False) -> None:
     """Write answers and report anew from what is stored."""
-    print_result(limbfit.report_population(trial), _show_stored, as_json)
+    console.print_result(limbfit.report_population(trial), _show_stored, as_json)
 
 
 def person(
@@ -100,14 +91,13 @@ def person(
     as_json: AsJson = False,
 ) -> None:
     """Open a person as ordinary studies, one for each rule, with reports; simulate who is not there."""
-    with listen_on_console() as listener:
-        found = limbfit.open_person(trial, number, listener=listener)
+    found = console.call_with_progress(limbfit.open_person, trial, number)
 
     def show(found: dict[str, Any]) -> None:
         for rule, study in found["studies"].items():
-            print_line(f"{rule}: limbfit studio {study!r}; report: {found['reports'][rule]}")
+            console.print_line(f"{rule}: limbfit studio {study!r}; report: {found['reports'][rule]}")
 
-    print_result(found, show, as_json)
+    console.print_result(found, show, as_json)
 
 
 def robust(
@@ -117,20 +107,19 @@ def robust(
     as_json: AsJson = False,
 ) -> None:
     """Search the rule that lowers the 90th percentile of the worst pressure, and check it on fresh people."""
-    with listen_on_console() as listener:
-        found = limbfit.make_robust(trial, people=people, fresh=fresh, listener=listener)
-    print_result(found, _show_stored, as_json)
+    found = console.call_with_progress(limbfit.make_robust, trial, people=people, fresh=fresh)
+    console.print_result(found, _show_stored, as_json)
 
 
 def _show_stored(content: dict[str, Any]) -> None:
     own = {key: value for key, value in content.items() if key not in ("report", "folder")}
     show_population(PopulationResult.model_validate(own))
-    print_line(f"stored in {content['folder']}; report: {content['report']}")
+    console.print_line(f"stored in {content['folder']}; report: {content['report']}")
 
 
 def show_population(found: PopulationResult) -> None:
     """How many people, and the answers: shares over limits, differences of rules, what drives them."""
-    print_line(
+    console.print_line(
         f"{found.people} people, {len(found.rejected)} limbs rejected, {len(found.failed)} simulations "
         f"failed; {found.seconds_per_person:.0f} s a person, {found.seconds_per_socket:.0f} s a socket"
     )
@@ -139,19 +128,19 @@ def show_population(found: PopulationResult) -> None:
             "rule": "rule",
             "over the limit": "limit",
             "share (%)": ("share_percent", ".0f"),
-            "95 % (%)": lambda row: format_ends(row.interval_percent, ".0f"),
+            "95 % (%)": lambda row: console.format_ends(row.interval_percent, ".0f"),
         }
-        print_table(found.shares, columns)
+        console.print_table(found.shares, columns)
     worst = [one for one in found.differences if one.place == WORST_PLACE]
     if worst:
         columns = {
             "rule": lambda row: f"{row.rule} - {row.beside}",
             "place": "place",
             "mean difference (kPa)": ("difference", ".1f"),
-            "95 % (kPa)": lambda row: format_ends(row.interval, ".1f"),
+            "95 % (kPa)": lambda row: console.format_ends(row.interval, ".1f"),
             "lower for (%)": ("lower_percent", ".0f"),
         }
-        print_table(worst, columns)
+        console.print_table(worst, columns)
     if found.drivers:
         columns = {
             "rule": "rule",
@@ -159,21 +148,21 @@ def show_population(found: PopulationResult) -> None:
             "first": ("first", ".2f"),
             "total": lambda row: f"{row.total:.2f} +- {row.total_interval:.2f}",
         }
-        print_table([one for one in found.drivers if one.total > LEAST_SHARE], columns)
+        console.print_table([one for one in found.drivers if one.total > LEAST_SHARE], columns)
     for one in found.surrogates:
-        print_line(
+        console.print_line(
             f"surrogate of {one.rule}: {one.error_kPa:.1f} kPa RMS at people left out, "
             f"{100 * one.explained:.0f} % of the variance"
         )
     if found.robust is not None:
         made, keys = found.robust, ", ".join(f"{key} {value:.2f}" for key, value in found.robust.keys.items())
-        print_line(
+        console.print_line(
             f"robust rule: {keys}; {made.checked_people} fresh people: 90th percentile of the worst pressure "
             f"{made.checked_p90_kPa:.1f} kPa ({made.predicted_p90_kPa:.1f} predicted), with {found.rules[0]} "
             f"{made.beside_p90_kPa:.1f}; mean difference {made.difference_kPa:.1f} kPa (95 %: "
-            f"{format_ends(made.interval_kPa, '.1f')})"
+            f"{console.format_ends(made.interval_kPa, '.1f')})"
         )
-    print_warnings(found.notes)
+    console.print_warnings(found.notes)
 
 
 for verb in (run, person, robust):

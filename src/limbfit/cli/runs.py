@@ -11,8 +11,9 @@ from typer import Argument, Exit, Option
 import limbfit
 
 from ..execution import QUEUES, Placement, place_jobs
+from . import console
 from .commands import StudyPath, stage_option
-from .console import AsJson, Column, listen_on_console, print_aside, print_json, print_line, print_table
+from .console import AsJson, Column
 
 _OPTIONS = {
     "workers": Annotated[
@@ -51,14 +52,14 @@ def batch(
 ) -> None:
     """Run many studies on the same workers; one that fails does not stop the others."""
     rows = []
-    with listen_on_console() as listener:
+    with console.listen_on_console() as listener:
         for row in limbfit.run_batch(studies, until=until, listener=listener):
             rows.append(row)
             if row["error"] and not as_json:
-                print_aside(f"failed: {row['study']}: {row['error']}")
+                console.print_aside(f"failed: {row['study']}: {row['error']}")
     failed = [row for row in rows if row["state"] == "failed"]
     if as_json:
-        print_json({"studies": rows, "failed": len(failed)})
+        console.print_json({"studies": rows, "failed": len(failed)})
     else:
         columns: dict[str, Column] = {
             "study": "study",
@@ -67,8 +68,8 @@ def batch(
             "fitted (%)": ("mean_error_fitted_percent", ".2f"),
             "held out (%)": ("mean_error_heldout_percent", ".2f"),
         }
-        print_table(rows, columns)
-        print_line(f"{len(rows) - len(failed)} of {len(rows)} studies done")
+        console.print_table(rows, columns)
+        console.print_line(f"{len(rows) - len(failed)} of {len(rows)} studies done")
     if failed:
         raise Exit(1)
 
@@ -80,18 +81,17 @@ def reproduce(
     as_json: AsJson = False,
 ) -> None:
     """Run a study again from its record in a new folder, and compare parameters and forces."""
-    with listen_on_console() as listener:
-        result = limbfit.reproduce_study(record, folder, tolerance=tolerance, listener=listener)
+    result = console.call_with_progress(limbfit.reproduce_study, record, folder, tolerance=tolerance)
     if as_json:
-        print_json(result)
+        console.print_json(result)
     else:
         for quantity in ("parameters", "forces"):
             name, difference = max(result[quantity].items(), key=lambda item: item[1])
-            print_line(f"{quantity}: at most {difference:.1e} apart, relative ({name})")
+            console.print_line(f"{quantity}: at most {difference:.1e} apart, relative ({name})")
         for name, (then, now) in result["versions"].items():
-            print_line(f"{name}: then {then or 'not installed'}, now {now or 'not installed'}")
+            console.print_line(f"{name}: then {then or 'not installed'}, now {now or 'not installed'}")
         verdict = "the same" if result["same"] else "not the same"
-        print_line(f"{verdict} within {tolerance:g}; run again in {folder}")
+        console.print_line(f"{verdict} within {tolerance:g}; run again in {folder}")
     if not result["same"]:
         raise Exit(1)
 
@@ -103,12 +103,12 @@ def doctor(
     """Check this machine: versions, cores, memory, solvers, meshers, write access, and a small problem."""
     result = limbfit.diagnose(folder)
     if as_json:
-        print_json(result)
+        console.print_json(result)
     else:
         for row in result["checks"]:
-            print_line(f"{row['state']:<8} {row['check']}: {row['found']}")
+            console.print_line(f"{row['state']:<8} {row['check']}: {row['found']}")
             if row["remedy"]:
-                print_line(f"         {row['remedy']}")
+                console.print_line(f"         {row['remedy']}")
     if not result["healthy"]:
         raise Exit(1)
 
@@ -123,8 +123,8 @@ def studio(
     """View and correct the limb, and watch its identification, in a browser on this machine."""
 
     def tell(address: str) -> None:
-        print_line(f"studio of {study}; Ctrl-C ends it, runs go on")
-        print_line(address)
+        console.print_line(f"studio of {study}; Ctrl-C ends it, runs go on")
+        console.print_line(address)
 
     limbfit.serve_studio(study, port=port, host=host, expose=expose, browser=not no_browser, tell=tell)
 

@@ -12,17 +12,9 @@ from ..errors import InputError
 from ..laws import split_key
 from ..results.socket import SocketDesignResult, SocketLoad, SocketResult
 from ..results.uncertainty import SocketOfModels
+from . import console
 from .commands import StudyPath, call_on_study
-from .console import (
-    AsJson,
-    Column,
-    format_ends,
-    print_line,
-    print_stored,
-    print_table,
-    print_warnings,
-    refuse_idle_options,
-)
+from .console import AsJson, Column
 from .runs import add_execution_options
 
 
@@ -60,12 +52,12 @@ def fit(
             remedy = "leave out --parameters, --literature and --samples"
             raise InputError("models have parameters of their own", place="--models", remedy=remedy)
         result = call_on_study(study, limbfit.fit_socket_of_models)
-        print_stored(result, "models_socket", show_socket_models, as_json)
+        console.print_stored(result, "models_socket", show_socket_models, as_json)
         return
     options = {"parameters": parameters, "literature": literature, "samples": samples or 0}
     result = call_on_study(study, limbfit.fit_socket, **options)
     result["report"] = call_on_study(study, limbfit.report_study)["report"]
-    print_stored(result, "socket", show_socket, as_json)
+    console.print_stored(result, "socket", show_socket, as_json)
 
 
 def show_socket_models(found: SocketOfModels) -> None:
@@ -74,39 +66,45 @@ def show_socket_models(found: SocketOfModels) -> None:
     for number, model in enumerate(found.models):
         head = f"{model.words}, {100 * model.weight:.0f} %"
         columns[head] = lambda row, number=number: f"{row.mean_kPa[number]:.1f}"  # type: ignore[misc]
-    columns["95 % by all models"] = lambda row: format_ends(row.interval_kPa, ".1f")
+    columns["95 % by all models"] = lambda row: console.format_ends(row.interval_kPa, ".1f")
     for load in found.loads:
-        print_line(f"{load.name}:")
-        print_table(load.regions, columns)
+        console.print_line(f"{load.name}:")
+        console.print_table(load.regions, columns)
 
 
 def show_socket(found: SocketResult) -> None:
     """A table for donning and each load."""
     for note in found.socket.notes:
-        print_line(f"socket: {note}")
+        console.print_line(f"socket: {note}")
     for name, state in found.states.items():
         settled = ""
         if isinstance(state, SocketLoad):
             settled = f", settled by {state.settling_mm:.1f} mm"
             if state.settling_interval_mm is not None:
-                interval = format_ends(state.settling_interval_mm, ".1f")
+                interval = console.format_ends(state.settling_interval_mm, ".1f")
                 cause = _format_main_cause(state.settling_interval_from)
                 settled += f" (95 %: {interval}, mostly from {cause})"
         area = f"in touch over {state.contact_area_mm2 / 100:.0f} cm2"
-        print_line(f"{name}: {state.peak_kPa:.0f} kPa at most, {area}{settled}")
-        print_table(state.regions, LOAD_COLUMNS)
+        console.print_line(f"{name}: {state.peak_kPa:.0f} kPa at most, {area}{settled}")
+        console.print_table(state.regions, LOAD_COLUMNS)
     if found.samples:
         words = "".join(f"; another failed: {reason}" for reason in found.samples.failed)
-        print_line(f"95 %: by derivatives and {found.samples.simulated} simulated draws{words}")
+        console.print_line(f"95 %: by derivatives and {found.samples.simulated} simulated draws{words}")
     if found.worn_s:
-        print_line(f"95 %: with what relaxation may do until the socket has been worn for {found.worn_s:g} s")
+        console.print_line(
+            f"95 %: with what relaxation may do until the socket has been worn for {found.worn_s:g} s"
+        )
     for row in (row for row in found.agreement if row.region == "all"):
-        limits = f" (95 % limits of agreement {format_ends(row.limits_kPa, '.1f')})" if row.limits_kPa else ""
+        limits = (
+            f" (95 % limits of agreement {console.format_ends(row.limits_kPa, '.1f')})"
+            if row.limits_kPa
+            else ""
+        )
         inside = f"{row.within_percent:.0f} % of {row.cells} cells within error and interval"
-        print_line(f"{row.load}: model minus measured {row.bias_kPa:.1f} kPa{limits}; {inside}")
+        console.print_line(f"{row.load}: model minus measured {row.bias_kPa:.1f} kPa{limits}; {inside}")
     balance = f"contact balances the loads within {found.balance_percent:.2g} %"
-    print_line(f"tissues: {found.parameters_from}; {balance}; not a medical device")
-    print_warnings(found.outside_text)
+    console.print_line(f"tissues: {found.parameters_from}; {balance}; not a medical device")
+    console.print_warnings(found.outside_text)
 
 
 def _format_main_cause(shares: Mapping[str, float] | None) -> str:
@@ -120,7 +118,7 @@ def _format_main_cause(shares: Mapping[str, float] | None) -> str:
 LOAD_COLUMNS: dict[str, Column] = {
     "region": "region",
     "mean (kPa)": ("mean_kPa", ".1f"),
-    "95 % (kPa)": lambda row: format_ends(row.interval_kPa, ".1f"),
+    "95 % (kPa)": lambda row: console.format_ends(row.interval_kPa, ".1f"),
     "mostly from": lambda row: _format_main_cause(row.interval_from),
     "peak (kPa)": ("peak_kPa", ".1f"),
     "shear (kPa)": ("shear_kPa", ".1f"),
@@ -139,7 +137,7 @@ def design(
     _check_choice(parameters, literature)
     regions = [name.strip() for name in optimise.split(",") if name.strip()]
     if not regions:
-        refuse_idle_options({"simulations": simulations}, "without --optimise")
+        console.refuse_idle_options({"simulations": simulations}, "without --optimise")
     result = call_on_study(
         study,
         limbfit.design_socket,
@@ -148,7 +146,7 @@ def design(
         parameters=parameters,
         literature=literature,
     )
-    print_stored(result, "socket_design", show_design, as_json)
+    console.print_stored(result, "socket_design", show_design, as_json)
 
 
 def show_design(found: SocketDesignResult) -> None:
@@ -160,7 +158,7 @@ def show_design(found: SocketDesignResult) -> None:
         reduced = design.reduction_percent
         around = f", {reduced:.2f} % less around" if reduced is not None else ""
         volume = f"{design.name}: {design.volume_cm3:.0f} cm3"
-        print_line(f"{volume}, {low:.1f} to {high:.1f} mm from the unloaded limb{around}")
+        console.print_line(f"{volume}, {low:.1f} to {high:.1f} mm from the unloaded limb{around}")
         columns[design.name] = (design.name, ".0f")
     starred = optimisation.regions if optimisation else ()
     rows = [
@@ -168,16 +166,16 @@ def show_design(found: SocketDesignResult) -> None:
         | {design.name: design.peaks_kPa.get(name) for design in designs}
         for name in designs[0].peaks_kPa
     ]
-    print_table(rows, {"region, peak (kPa)": "region", **columns}, dash="")
+    console.print_table(rows, {"region, peak (kPa)": "region", **columns}, dash="")
     if optimisation:
         beyond = f"beyond its limit: {', '.join(optimisation.beyond_limits)}"
         rest = beyond if optimisation.beyond_limits else "all others within their limits"
-        print_line(f"* optimised in {len(optimisation.trials) - 1} simulations; {rest}")
+        console.print_line(f"* optimised in {len(optimisation.trials) - 1} simulations; {rest}")
     thickness = f"{wall.stated_mm:g} mm, measured {wall.least_mm:.2f} mm at least"
-    print_line(f"socket.stl: the {wall.of} with a wall of {thickness}; not a medical device")
+    console.print_line(f"socket.stl: the {wall.of} with a wall of {thickness}; not a medical device")
     if found.shop:
-        print_line(f"for the shop, in shop: {', '.join(found.shop.files)}")
-        print_warnings(found.shop.left_out)
+        console.print_line(f"for the shop, in shop: {', '.join(found.shop.files)}")
+        console.print_warnings(found.shop.left_out)
 
 
 def _check_choice(parameters: str | None, literature: bool) -> None:
