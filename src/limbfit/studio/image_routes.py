@@ -15,7 +15,7 @@ import numpy as np
 import SimpleITK as sitk  # noqa: N813
 from fastapi import APIRouter, Response
 from matplotlib.colors import to_hex
-from pydantic import BaseModel, Field
+from pydantic import BaseModel, Field, NonNegativeInt, PositiveInt
 
 from ..anatomy.grid import Grid, LabelMap, Volume
 from ..anatomy.imaging import read_labels, write_labels
@@ -36,8 +36,6 @@ BESIDE = "corrected.seg.nrrd"
 # Index axes to the right, to the front and up: the order in which the page counts voxels.
 PAGE_AXES = np.diag([-1.0, -1.0, 1.0])
 MAX_RUNS = 2_000_000
-Whole = Annotated[int, Field(ge=0)]
-Positive = Annotated[int, Field(gt=0)]
 Label = Annotated[int, Field(ge=0, le=255)]
 
 
@@ -45,7 +43,7 @@ class Painting(BaseModel):
     """Painted voxels as runs ``[first, count, label]`` of the page's order, and on which labels they are."""
 
     base: Annotated[str, Field(min_length=1, max_length=80)]
-    runs: Annotated[list[tuple[Whole, Positive, Label]], Field(min_length=1, max_length=MAX_RUNS)]
+    runs: Annotated[list[tuple[NonNegativeInt, PositiveInt, Label]], Field(min_length=1, max_length=MAX_RUNS)]
 
 
 @router.get("")
@@ -111,11 +109,7 @@ def post_labels(folder: Folder, painting: Painting) -> Json:
         _save_labels(folder, study, shown, painted)
     saved = _find_shown_labels(folder)
     assert saved is not None
-    return {
-        "changed_voxels": changed,
-        "base": saved.digest,
-        "saved_to": saved.name_target(folder.load()),
-    }
+    return {"changed_voxels": changed, "base": saved.digest, "saved_to": saved.name_target(folder.load())}
 
 
 @router.get("/surfaces/{name}")

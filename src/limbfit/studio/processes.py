@@ -161,7 +161,7 @@ def start_command(words: Sequence[str], folder: Path, stderr: int | IO[bytes] = 
 
     It is started in ``folder``, but takes no code from there. Returns its process number.
     """
-    process = subprocess.Popen(
+    process = psutil.Popen(
         [sys.executable, *words],
         stdin=subprocess.DEVNULL,
         stdout=subprocess.DEVNULL,
@@ -170,18 +170,11 @@ def start_command(words: Sequence[str], folder: Path, stderr: int | IO[bytes] = 
         env=os.environ | SAFE_PATH,
         start_new_session=True,
     )
-    while process.poll() is None and not _has_command_line(process.pid):
-        time.sleep(0.001)
+    with suppress(psutil.NoSuchProcess):  # it has ended
+        while not process.cmdline():  # by which it is found, and which at first is empty
+            time.sleep(0.001)
     Thread(target=process.wait, daemon=True).start()  # so that it leaves the table of processes
     return process.pid
-
-
-def _has_command_line(process: int) -> bool:
-    """True when the process can be found by its command line, which at first is empty, or has ended."""
-    try:
-        return bool(psutil.Process(process).cmdline())
-    except psutil.NoSuchProcess:
-        return True
 
 
 def interrupt_process(process: int) -> None:

@@ -307,9 +307,9 @@ def read_arrays(file: Path) -> dict[str, np.ndarray]:
 
 def _list_downloads(folder: StudyFolder) -> list[dict[str, str]]:
     """``title`` and ``path`` below ``/api/files`` of the report and its tables."""
-    files = [("report/report.html", "report (HTML)"), ("report/methods.md", "methods (Markdown)")]
-    for file in sorted((folder.results / "report" / "tables").glob("*.csv")):
-        files.append((f"report/tables/{file.name}", f"table {file.stem} (CSV)"))
+    tables = sorted((folder.results / "report" / "tables").glob("*.csv"))
+    named = {f"report/tables/{file.name}": f"table {file.stem} (CSV)" for file in tables}
+    files = {"report/report.html": "report (HTML)", "report/methods.md": "methods (Markdown)", **named}
     return _select_stored(folder, files)
 
 
@@ -317,17 +317,19 @@ def _list_site_downloads(folder: StudyFolder, site: str) -> list[dict[str, str]]
     """The same for one site: curves, fields, the FEBio input where it was written."""
     indentation = folder.load().indentation(site)
     name, place = indentation.name, indentation.site.name
-    files = [
-        (f"predict/{name}.csv", "predicted curves (CSV)"),
-        (f"traces/{name}.csv", "regularised record (CSV)"),
-        (f"predict/{name}.vtu", "fields at the deepest point (VTU)"),
-        (f"simulate/{name}.csv", "simulated curve (CSV)"),
-        (f"simulate/{name}.vtu", "simulated fields (VTU)"),
-        (f"mesh/{place}.vtu", "mesh (VTU)"),
-        (f"export/{name}.feb", "FEBio input (.feb)"),
-    ]
+    files = {
+        f"predict/{name}.csv": "predicted curves (CSV)",
+        f"traces/{name}.csv": "regularised record (CSV)",
+        f"predict/{name}.vtu": "fields at the deepest point (VTU)",
+        f"simulate/{name}.csv": "simulated curve (CSV)",
+        f"simulate/{name}.vtu": "simulated fields (VTU)",
+        f"mesh/{place}.vtu": "mesh (VTU)",
+        f"export/{name}.feb": "FEBio input (.feb)",
+    }
     return _select_stored(folder, files)
 
 
-def _select_stored(folder: StudyFolder, files: list[tuple[str, str]]) -> list[dict[str, str]]:
-    return [{"title": title, "path": path} for path, title in files if (folder.results / path).is_file()]
+def _select_stored(folder: StudyFolder, files: dict[str, str]) -> list[dict[str, str]]:
+    return [
+        {"title": title, "path": path} for path, title in files.items() if (folder.results / path).is_file()
+    ]

@@ -96,20 +96,20 @@ def create_app(folder: StudyFolder, guard: AccessGuard) -> FastAPI:
     """The application over one study, protected by its guard."""
     app = FastAPI(title="limbfit studio", docs_url=None, redoc_url=None, openapi_url=None)
     app.state.folder = folder
+
+    def respond_error(request: Request, error: Exception) -> JSONResponse:
+        status, text = _describe_error(error)
+        return JSONResponse({"error": text}, status)
+
     for routes in ROUTES:
         app.include_router(routes.router)
     for kind in ERRORS:
-        app.add_exception_handler(kind, _respond_error)
+        app.add_exception_handler(kind, respond_error)
     app.add_api_route("/", lambda: FileResponse(STATIC / "index.html"))
     app.mount("/static", StaticFiles(directory=STATIC))
     app.mount("/web", StaticFiles(directory=SHARED))
     app.add_middleware(GuardMiddleware, guard=guard)
     return app
-
-
-def _respond_error(request: Request, error: Exception) -> JSONResponse:
-    status, text = _describe_error(error)
-    return JSONResponse({"error": text}, status)
 
 
 def _describe_error(error: Exception) -> tuple[int, str]:

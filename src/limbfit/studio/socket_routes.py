@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import igl
 import numpy as np
 from fastapi import APIRouter, Response
-from pydantic import Field
+from pydantic import Field, FiniteFloat
 
 from ..errors import InputError, SurfaceError
 from ..mesh import read_vtu
@@ -33,7 +33,6 @@ SOCKET = "socket"  # the run of `limbfit socket`; others are designs, by their n
 NO_LIMB_YET = "there is no limb yet to draw a socket around: run the stages until surfaces"
 _FIELDS = {"pressure": "pressure_kPa", "shear": "shear_kPa"}
 HANDLE_COUNT = 16  # along a brim that is no stated line
-Length = Annotated[float, Field(allow_inf_nan=False)]
 
 
 class AreaRequest(StrictModel):
@@ -42,8 +41,8 @@ class AreaRequest(StrictModel):
     name: Text
     position: Place | None = None
     region: Text | None = None
-    radius_mm: Length
-    depth_mm: Length
+    radius_mm: FiniteFloat
+    depth_mm: FiniteFloat
 
 
 class TrimlineRequest(StrictModel):

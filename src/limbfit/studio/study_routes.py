@@ -53,16 +53,9 @@ def get_study(folder: Folder) -> Json:
         "has_image": study.image is not None,
         "sites": [{"name": site.name} for site in study.sites],
         "indentations": [
-            {
-                "name": indentation.name,
-                "region": indentation.region,
-                "fitted": indentation.fitted,
-                "has_trace": indentation.trace is not None,
-                "is_recorded": study.is_recorded(indentation),
-                "touch_down_s": indentation.touch_down_s,
-                "peak_s": indentation.peak_s,
-            }
-            for indentation in study.indentations
+            {key: getattr(one, key) for key in ("name", "region", "fitted", "touch_down_s", "peak_s")}
+            | {"has_trace": one.trace is not None, "is_recorded": study.is_recorded(one)}
+            for one in study.indentations
         ],
     }
 
