@@ -29,7 +29,7 @@ from ..socket.shape import build_loadable_socket, build_regions, check_load, che
 from .acquire import build_device_settings
 from .experiments import EXPERIMENTS, check_experiment
 from .other_solvers import FORMATS, check_export
-from .run import compute_keys
+from .run import is_done
 
 _COMMANDS = {"protocol": "design --protocol", "socket_design": "socket design"}
 
@@ -96,8 +96,7 @@ def _read_geometry(study: Study) -> tuple[LimbGeometry | None, tuple[str, ...] |
     store = Store(study.results)
     if store.stamp("sites") is None:  # then there is no need to read every image for its digest
         return None, bones, facts
-    are_placed = store.state("sites", compute_keys(study, "sites")["sites"]).state == "done"
-    return LimbGeometry.from_store(store) if are_placed else None, bones, facts
+    return LimbGeometry.from_store(store) if is_done(study, "sites") else None, bones, facts
 
 
 def _describe_indenters(study: Study) -> Iterator[str]:

@@ -302,16 +302,22 @@ def _solve_matched(prepared: PreparedIndentation, problem: Problem, by_febio: Re
 def _store_curves(name: str, by_febio: Result, runs: Mapping[str, Result], files: CurveFiles) -> None:
     """All curves as a table and a picture, as far as every simulation went."""
     times = _select_common_times(by_febio, min(runs.values(), key=lambda run: run.times[-1]))
-    curves = {key: run.force_at(times) for key, run in runs.items()}
-    febio_N = by_febio.force[: len(times)]
-    write_curves(
-        Path(files.csv),
-        time_s=times,
-        displacement_mm=by_febio.displacement[: len(times)],
-        febio_N=febio_N,
-        **{f"{key}_N": force for key, force in curves.items()},
-    )
-    _draw(Path(files.png), name, times, febio_N, curves)
+    curves = {f"{key}_N": run.force_at(times) for key, run in runs.items()}
+    displacement_mm, febio_N = by_febio.displacement[: len(times)], by_febio.force[: len(times)]
+    columns = {"time_s": times, "displacement_mm": displacement_mm, "febio_N": febio_N}
+    write_curves(Path(files.csv), **columns, **curves)
+    labels = ("limbfit", "limbfit, FEBio's contact penalty")
+    with matplotlib.rc_context({"font.size": 9, "axes.spines.top": False, "axes.spines.right": False}):
+        drawing = Figure(figsize=(9.6, 3.2), layout="constrained", dpi=150)
+        left, right = drawing.subplots(1, 2)
+        left.plot(times, febio_N, "o", ms=3.5, mfc="none", color="0.3", label="FEBio")
+        for force, label, style in zip(curves.values(), labels, ("-", "--"), strict=True):
+            left.plot(times, force, style, label=label)
+            right.plot(times, 100.0 * (force - febio_N) / max(febio_N.max(initial=0.0), 1e-12), style)
+        left.set(xlabel="Time (s)", ylabel="Force (N)", title=f"Site {name}")
+        right.set(xlabel="Time (s)", ylabel="Difference (% of FEBio's peak)")
+        left.legend(frameon=False)
+        drawing.savefig(files.png)
 
 
 def _select_common_times(by_febio: Result, by_limbfit: Result) -> Array:
@@ -342,18 +348,3 @@ def _summarise_solver(run: Result) -> dict[str, Any]:
         "steps": run.statistics["steps"],
         "seconds": run.statistics["seconds"]["total"] or None,
     }
-
-
-def _draw(file: Path, name: str, times: Array, febio_N: Array, curves: dict[str, Array]) -> None:
-    words = {"limbfit": "limbfit", "limbfit_matched": "limbfit, FEBio's contact penalty"}
-    with matplotlib.rc_context({"font.size": 9, "axes.spines.top": False, "axes.spines.right": False}):
-        drawing = Figure(figsize=(9.6, 3.2), layout="constrained", dpi=150)
-        left, right = drawing.subplots(1, 2)
-        left.plot(times, febio_N, "o", ms=3.5, mfc="none", color="0.3", label="FEBio")
-        for (key, force), style in zip(curves.items(), ("-", "--")):
-            left.plot(times, force, style, label=words[key])
-            right.plot(times, 100.0 * (force - febio_N) / max(febio_N.max(initial=0.0), 1e-12), style)
-        left.set(xlabel="Time (s)", ylabel="Force (N)", title=f"Site {name}")
-        right.set(xlabel="Time (s)", ylabel="Difference (% of FEBio's peak)")
-        left.legend(frameon=False)
-        drawing.savefig(file)

@@ -119,6 +119,11 @@ def _compute_chain(keys: Keys, until: str = "report") -> dict[str, StageKey]:
     return chain
 
 
+def is_done(study: Study, stage: str) -> bool:
+    """True where what a stage has stored is of the study as it is now."""
+    return Store(study.results).state(stage, compute_keys(study, stage)[stage]).state == "done"
+
+
 def _select_calibration_inputs(study: Study) -> Study:
     """The study's fitted sites; with markers the others' places too, since each marker goes to one site."""
     sites = [site.model_copy(update={"region": ""}) for site in study.fitted]
@@ -351,21 +356,11 @@ def run_record(study: Study) -> RunResult:
         versions=collect_versions(),
         machine=MachineFacts(**describe_machine()),
         inputs=inputs,
-        stages={
-            name: StageRecord(seconds=stamp.seconds, finished=stamp.finished, key=stamp.key)
-            for name in below
-            if (stamp := store.stamp(name))
-        },
+        stages={name: StageRecord.model_validate(stamp) for name in below if (stamp := store.stamp(name))},
         experiments={
-            state.stage: ExperimentRecord(
-                state=state.state,
-                seconds=state.seconds,
-                finished=state.finished,
-                options=options,
-                key=key.digest,
-            )
-            for state, key, options in list_experiment_states(keys, below)
-            if state.state in ("done", "stale")
+            state.pop("stage"): ExperimentRecord(**state, options=options, key=key.digest)
+            for one, key, options in list_experiment_states(keys, below)
+            if (state := asdict(one))["state"] in ("done", "stale")
         },
     )
 

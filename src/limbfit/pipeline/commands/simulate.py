@@ -22,7 +22,7 @@ from ..simulation.limb_geometry import LimbGeometry
 from ..simulation.loading import LimbAxis, LoadHistory, describe_indentation, read_strain_extents
 from ..simulation.simulations import CURVE_POINTS
 from .experiments import IDENTIFIED
-from .run import compute_keys, ensure_compiled, run_study
+from .run import ensure_compiled, is_done, run_study
 
 FEB_NAME, FORCES = "model.feb", "forces.txt"
 
@@ -192,10 +192,7 @@ def run_febio_site(prepared: PreparedIndentation, program: Path, folder: Path) -
 
 def read_recorded_range(study: Study) -> RecordedExtents | None:
     """What the fitted records did to the tissue; None where the prediction, which stores it, is not done."""
-    store = Store(study.results)
-    if store.state("predict", compute_keys(study, "predict")["predict"]).state != "done":
-        return None
-    return store.results.predict.recorded_range
+    return Store(study.results).results.predict.recorded_range if is_done(study, "predict") else None
 
 
 def choose_parameters(study: Study, given: Parameters | None = None) -> tuple[Parameters, str]:
@@ -213,7 +210,7 @@ def choose_parameters(study: Study, given: Parameters | None = None) -> tuple[Pa
     if store.stamp("calibrate") is None:
         start = {tissue: study.material.get(tissue, "start") for tissue in study.tissues}
         return start, "start of the study"
-    if store.state("calibrate", compute_keys(study, "calibrate")["calibrate"]).state != "done":
+    if not is_done(study, "calibrate"):
         raise InputError(
             "the identified parameters are stale: made from other inputs, settings or code",
             file=store["calibrate"] / "calibration.json",
