@@ -335,16 +335,14 @@ def fit_socket_of_models(study: Study, *, listener: Listener = ignore_progress) 
 
 def _mix_pressures(sockets: Sequence[SocketResult], weights: Array) -> list[stored.MixedLoad]:
     """For donning and each load, the mean pressure of each region by every model, and of all."""
-    names = ["donning", *(load.name for load in sockets[0].loads)]
-    held = [[one.donning, *one.loads] for one in sockets]
+    held = [socket.states for socket in sockets]
+    mixed = {
+        name: zip(*(states[name].regions for states in held), strict=True)  # each region by every model
+        for name in held[0]
+    }
     return [
-        stored.MixedLoad(
-            name=name,
-            regions=[
-                _mix_region(same, weights) for same in zip(*(state.regions for state in states), strict=True)
-            ],
-        )
-        for name, *states in zip(names, *held, strict=True)
+        stored.MixedLoad(name=name, regions=[_mix_region(same, weights) for same in regions])
+        for name, regions in mixed.items()
     ]
 
 

@@ -20,6 +20,7 @@ Mask = NDArray[np.bool_]
 
 COLOURS = {LIMB: "#e34a33", FAT: "#f28e2b", "tibia": "#3bb2d0", "fibula": "#f4c542"}
 _OTHERS = ("#76d275", "#c58af9", "#ff9da7", "#9aa0ff")
+_WIDTH_IN = 12.0
 _COLUMNS, _ROWS = 6, 3
 _SUSPECT_COLUMNS = 3  # suspects in a row
 _MAX_SUSPECTS = 6  # suspects drawn
@@ -35,33 +36,25 @@ def draw_sheet(path: str | Path, volume: Volume, labels: LabelMap, quality: Qual
     masks = {LIMB: turned.limb} | {name: turned.mask(name) for name in names}
     others = iter(_OTHERS * len(masks))
     colours = {name: COLOURS.get(name) or next(others) for name in masks}
-    shown = _choose_slices(turned.limb)
-    odd = _choose_suspects(quality)
-    large_rows = -(-len(odd) // _SUSPECT_COLUMNS)
+    overview = [(k, f"slice {k}", "normal") for k in _choose_slices(turned.limb)]
+    suspects = [(k, f"slice {k}: {text}", "bold") for k, text in _choose_suspects(quality)]
+    parts = [(_COLUMNS, overview), *([(_SUSPECT_COLUMNS, suspects)] if suspects else [])]
     height, width = (part.stop - part.start for part in window)
     ratio = float(width * turned.spacing[0] / (height * turned.spacing[1]))
-    small, large = 12 / _COLUMNS / ratio + 0.25, 12 / _SUSPECT_COLUMNS / ratio + 0.3
-    rows = -(-len(shown) // _COLUMNS)
-    figure = Figure(figsize=(12, 0.9 + rows * small + large_rows * large), facecolor="white")
+    rows = [-(-len(slices) // columns) for columns, slices in parts]
+    heights = [count * (_WIDTH_IN / columns / ratio + 0.25) for count, (columns, _) in zip(rows, parts)]
+    figure = Figure(figsize=(_WIDTH_IN, 0.5 + sum(heights)), facecolor="white", layout="constrained")
     FigureCanvasAgg(figure)
-    grid = figure.add_gridspec(
-        rows + large_rows,
-        _COLUMNS,
-        height_ratios=[small] * rows + [large] * large_rows,
-        **{"left": 0.01, "right": 0.99, "top": 1 - 0.5 / figure.get_figheight(), "bottom": 0.01},
-        wspace=0.04,
-        hspace=0.14,
-    )
-    span = _COLUMNS // _SUSPECT_COLUMNS
-    for n, k in enumerate(shown):
-        axes = figure.add_subplot(grid[n // _COLUMNS, n % _COLUMNS])
-        _draw(axes, image, masks, colours, k, window, f"slice {k}")
-    for n, (k, text) in enumerate(odd):
-        place = (n % _SUSPECT_COLUMNS) * span
-        axes = figure.add_subplot(grid[rows + n // _SUSPECT_COLUMNS, place : place + span])
-        _draw(axes, image, masks, colours, k, window, f"slice {k}: {text}", bold=True)
+    places = figure.subfigures(len(parts), 1, squeeze=False, height_ratios=heights).ravel()
+    for place, count, (columns, slices) in zip(places, rows, parts, strict=True):
+        axes = place.subplots(count, columns, squeeze=False).ravel()
+        for ax in axes:
+            ax.axis("off")
+        for ax, (k, title, weight) in zip(axes, slices):
+            _draw(ax, image, masks, colours, k, window)
+            ax.set_title(title, fontsize=8, pad=2, fontweight=weight)
     handles = [Line2D([], [], color=colours[name], label=name) for name in masks]
-    figure.legend(handles=handles, loc="upper center", ncol=len(handles), frameon=False, fontsize=10)
+    figure.legend(handles=handles, loc="outside upper center", ncol=len(handles), frameon=False, fontsize=10)
     figure.savefig(path, dpi=100, metadata={"Software": "limbfit"})
 
 
@@ -84,14 +77,7 @@ def _choose_suspects(quality: QualityResult) -> list[tuple[int, str]]:
 
 
 def _draw(
-    axes: Axes,
-    image: Volume,
-    masks: dict[str, Mask],
-    colours: dict[str, str],
-    k: int,
-    window: Box,
-    title: str,
-    bold: bool = False,
+    axes: Axes, image: Volume, masks: dict[str, Mask], colours: dict[str, str], k: int, window: Box
 ) -> None:
     """One slice with the outlines of its labels."""
     rows, columns = window
@@ -108,5 +94,3 @@ def _draw(
     axes.set_xlim(*extent)
     axes.set_ylim(*heights)
     axes.set_aspect(float(image.spacing[1] / image.spacing[0]))
-    axes.set_title(title, fontsize=8, pad=2, fontweight="bold" if bold else "normal")
-    axes.axis("off")

@@ -137,8 +137,7 @@ def make_timing_section(store: Results) -> Section:
 def make_settings_section(store: Results) -> Section:
     """Every setting of the study file."""
     flat = flatten_settings(store.run.settings if store.run else {})
-    table = make_pair_table("all-settings", ("Key", "Value"), flat)
-    return make_section("settings", table)
+    return make_section("settings", make_pair_table("all-settings", ("Key", "Value"), flat))
 
 
 def make_provenance_section(store: Results) -> Section:

@@ -66,16 +66,19 @@ def _find_leading_tissues(content: stored.StiffnessResult) -> dict[str, dict[str
 
 
 @styled
-def _draw_stiffness_figure(store: Results, content: stored.StiffnessResult) -> Figure:
+def _draw_two_sites(
+    store: Results, content: Any, name: str, draw_all_sites: Callable[[Axes, Any], None]
+) -> Figure:
+    """Curves of the first two sites, and in a last panel what is known of all of them."""
     sites = content.sites[:2]
-    drawing, axes = make_panels(len(sites) + 1, len(sites) + 1, 2.9)
-    tissues = list(content.parameters)
+    drawing, axes = make_panels(len(sites) + 1, len(sites) + 1, 2.8)
     for ax, site in zip(axes, sites, strict=False):
-        _draw_curves(ax, store, "sensitivity-c", site, content)
-    _draw_derivatives(axes[-1], content, tissues)
+        _draw_curves(ax, store, name, site, content)
     axes[0].set_ylabel("Force (N)")
+    draw_all_sites(axes[-1], content)
+    axes[-1].legend(fontsize=8)
     add_legend(drawing, axes[0], columns=5)
-    return make_figure(drawing, "sensitivity-c", content=content)
+    return make_figure(drawing, name, content=content)
 
 
 def _draw_curves(
@@ -93,8 +96,8 @@ def _draw_curves(
     ax.margins(x=0.01)
 
 
-def _draw_derivatives(ax: Axes, content: stored.StiffnessResult, tissues: Sequence[str]) -> None:
-    for i, tissue in enumerate(tissues):
+def _draw_derivatives(ax: Axes, content: stored.StiffnessResult) -> None:
+    for i, tissue in enumerate(content.parameters):
         rows = [row for row in content.local if row.peak_percent_per_percent[tissue] is not None]
         depth = [row.tissue_mm for row in rows]
         slope = np.array([row.peak_percent_per_percent[tissue] for row in rows], dtype=float)
@@ -103,7 +106,6 @@ def _draw_derivatives(ax: Axes, content: stored.StiffnessResult, tissues: Sequen
     ax.set_title("% of force for 1 % of c")
     ax.set_xlabel("Tissue to the nearest bone (mm)")
     ax.set_ylim(0.0, 1.1 * max(ax.get_ylim()[1], 0.1))
-    ax.legend(fontsize=8)
 
 
 @styled
@@ -130,26 +132,16 @@ def _draw_kappa_figure(store: Results, content: stored.VolumeResult) -> Figure:
     return make_figure(drawing, "sensitivity-kappa")
 
 
-@styled
-def _draw_mesh_figure(store: Results, content: stored.RefinementResult) -> Figure:
-    sites = content.sites[:2]
-    drawing, axes = make_panels(len(sites) + 1, len(sites) + 1, 2.7)
-    for ax, site in zip(axes, sites, strict=False):
-        _draw_curves(ax, store, "sensitivity-mesh", site, content)
+def _draw_refinement(ax: Axes, content: stored.RefinementResult) -> None:
     for i, site in enumerate(content.sites):
         rows = [row for row in content.runs if row.site == site.site and row.completed]
         color, line = _STYLES[i % len(_STYLES)]
         edge, peak = np.array([(row.edge_near_mm, row.peak_force_N) for row in rows], dtype=float).T
-        axes[-1].plot(edge, peak, color=color, ls=line, marker="o", label=f"site {site.site}")
+        ax.plot(edge, peak, color=color, ls=line, marker="o", label=f"site {site.site}")
         if site.limit_N is not None and site.order is not None:
-            axes[-1].plot(0.0, site.limit_N, color=color, marker="x", ls="", mew=1.8)
-    axes[0].set_ylabel("Force (N)")
-    axes[-1].set_title("Largest force (N)")
-    axes[-1].set_xlabel("Edge near the indenter (mm)")
-    axes[-1].set_xlim(left=-0.2)
-    axes[-1].legend(fontsize=8)
-    add_legend(drawing, axes[0])
-    return make_figure(drawing, "sensitivity-mesh")
+            ax.plot(0.0, site.limit_N, color=color, marker="x", ls="", mew=1.8)
+    ax.set(title="Largest force (N)", xlabel="Edge near the indenter (mm)")
+    ax.set_xlim(left=-0.2)
 
 
 @styled
@@ -172,11 +164,11 @@ def _list_warnings(content: stored.VariedResult) -> Bullets | None:
 
 
 _FIGURES: dict[str, Callable[[Results, Any], Figure]] = {  # what draws that of each experiment
-    "sensitivity-c": _draw_stiffness_figure,
+    "sensitivity-c": partial(_draw_two_sites, name="sensitivity-c", draw_all_sites=_draw_derivatives),
     "sensitivity-kappa": _draw_kappa_figure,
     "sensitivity-contact": _draw_site_curves,
     "sensitivity-indenter": _draw_site_curves,
-    "sensitivity-mesh": _draw_mesh_figure,
+    "sensitivity-mesh": partial(_draw_two_sites, name="sensitivity-mesh", draw_all_sites=_draw_refinement),
 }
 SENSITIVITIES = {name: partial(make_sensitivity_section, name=name) for name in _FIGURES}
 
