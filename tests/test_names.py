@@ -27,7 +27,7 @@ reproduce resample rescale resolve respond restate restrict resume rotate round 
 schedule search segment select send serve set share shorten show silence simulate smooth snap solve
 split spread stack start state step stop store sum summarise take tell temper test thicken thin time to
 touch transfer translate triangulate trim try turn unpack untangle update vary voxelise walk warm warn
-weigh whiten widen wrap write
+watch weigh whiten widen wrap write
     """.split()  # noqa: SIM905
 )
 PREDICATES = frozenset({"is", "has", "can", "are", "prefers"})

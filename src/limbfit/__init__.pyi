@@ -101,6 +101,7 @@ from .pipeline.commands.simulate import (
     simulate_feb as simulate_feb,
     simulate_site as simulate_site,
 )
+from .pipeline.commands.watch import watch_records as watch_records
 from .population.shape_model import (
     ShapeModel as ShapeModel,
     build_shape_model as build_shape_model,

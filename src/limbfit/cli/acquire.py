@@ -1,12 +1,13 @@
 """Indentations on a device: recorded, shown while they run, judged; and a device that is a program."""
 
+import json
 import os
 import select
 import signal
 import sys
 from collections import deque
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager, nullcontext, suppress
 from importlib.util import find_spec
 from pathlib import Path
 from queue import SimpleQueue
@@ -36,6 +37,8 @@ from ..acquire import (
 from ..acquire.protocol import Abort
 from ..acquire.virtual import Endpoint, read_faults
 from ..errors import InputError
+from ..pipeline.records.traces import describe_record
+from ..results.limb import RecordVerdict
 from .commands import StudyPath
 from .console import STDERR, AsJson, print_aside, print_json, print_line, print_result
 
@@ -165,6 +168,41 @@ def _show_recording(result: dict[str, Any]) -> None:
     _show_checks(result["verdict"])
 
 
+def watch(
+    folder: Annotated[Path, Argument(help="folder into which a rig writes records", show_default=False)],
+    study: Annotated[
+        Path | None, Option(help="study whose [traces] names the columns, and whose sites the records are of")
+    ] = None,
+    once: Annotated[bool, Option("--once", help="judge what is there, and end")] = False,
+    as_json: Annotated[
+        bool, Option("--json", help="print one line of JSON a record, and nothing else")
+    ] = False,
+) -> None:
+    """Judge each record as a rig writes it, and say which to make again; Ctrl-C ends it."""
+    loaded = None if study is None else limbfit.load_study(study, recorded=False)
+    verdicts: set[str] = set()
+    if not once:
+        print_aside(f"watching {folder}; Ctrl-C ends it")
+    with suppress(KeyboardInterrupt):
+        for found in limbfit.watch_records(folder, loaded, once=once):
+            verdicts.add(found.verdict)
+            if as_json:
+                print_line(json.dumps(found.to_plain(), allow_nan=False))
+            else:
+                _show_verdict(found)
+            sys.stdout.flush()
+    if once and "bad" in verdicts:
+        raise Exit(1)
+
+
+def _show_verdict(found: RecordVerdict) -> None:
+    word = "BAD" if found.verdict == "bad" else found.verdict
+    name = f"{found.file} (site {found.record})" if found.record else found.file
+    print_line(f"{word:<5}{name}" + (f": {describe_record(found.facts)}" if found.facts else ""))
+    for reason in found.reasons:
+        print_line(f"     {reason}")
+
+
 def virtual_fitsocket(
     study: StudyPath,
     seed: Annotated[int, Option(help="seed of the limb's place and the sensors' noise", min=0)] = 0,
@@ -285,4 +323,4 @@ def read_keys(events: SimpleQueue[Event], gap_s: float) -> Iterator[None]:
         termios.tcsetattr(handle, termios.TCSADRAIN, before)
 
 
-VERBS = (acquire, recording, virtual_fitsocket)
+VERBS = (acquire, recording, watch, virtual_fitsocket)

@@ -306,3 +306,13 @@ class TracesResult(StoredResult):
     FILE: ClassVar = "traces/traces.json"
 
     sites: Mapping[str, TraceFacts] = Field(description="Each record, by its name.")
+
+
+class RecordVerdict(ResultPart):
+    """Whether a record that a rig has just written can be used."""
+
+    file: str = Field(description="Path of the file below the folder that is watched.")
+    record: str | None = Field(description="Name of the study's record; null: the study names no such file.")
+    verdict: str = Field(description="`good`, `look` (it can be used, with doubts) or `bad` (make it again).")
+    reasons: Sequence[str] = Field(description="Why it is not good, each with its remedy.")
+    facts: TraceFacts | None = Field(description="The record as it would be used; null: it cannot be.")

@@ -8,4 +8,4 @@ from .loading import load_study
 from .material import MaterialTable
 from .records import Indentation, Record, Site
 from .study import Study
-from .tables import AcquireTable, ClampsTable, IndenterTable, SolverTable, Vector
+from .tables import AcquireTable, ClampsTable, IndenterTable, SolverTable, TracesTable, Vector

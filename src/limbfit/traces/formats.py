@@ -17,6 +17,7 @@ from scipy.io import loadmat, whosmat
 from ..errors import TraceError
 from ..extensions import import_extra
 
+TEXT_SUFFIXES = (".csv", ".txt", ".tsv", ".dat", ".asc", ".lvm")  # that rigs give to tables
 BINARY_SUFFIXES = (".mat", ".tdms", ".xlsx", ".xlsm", ".xls")  # of files that are no text
 MAX_PREAMBLE = 1000  # lines before the header
 MAX_SAMPLES = 20_000_000

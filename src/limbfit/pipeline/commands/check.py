@@ -21,7 +21,7 @@ from ..limb.segment import check_labels, read_marked_image, read_study_image, re
 from ..limb.sites import place_site
 from ..limb.surfaces import read_given_anatomy
 from ..records.record_checks import choose_surface_points, record_flags
-from ..records.traces import SecondaryMeasurement, read_observed, read_record
+from ..records.traces import SecondaryMeasurement, describe_record, read_observed, read_record
 from ..simulation.limb_geometry import LimbGeometry
 from ..simulation.loading import LimbAxis, LoadHistory, describe_indentation, name_load, time_socket_loads
 from ..socket.measured import describe_measured
@@ -55,7 +55,7 @@ def check_study(study: Study, *, listener: Listener = ignore_progress) -> dict[s
         records[one.name] = record
         secondary[one.name] = read_observed(study, one, trace, record.touch_down_s, smooth)
         steps_s[one.name] = float(np.median(np.diff(trace.time_s)))
-        facts.append(_describe_record(one.name, record))
+        facts.append(f"site {one.name}: {describe_record(record)}")
     facts += _describe_fit(study)
     motions = {name: measured.motion for name, measured in secondary.items()}
     facts += _describe_surface_motion(study, motions, limb)
@@ -105,15 +105,6 @@ def _describe_indenters(study: Study) -> Iterator[str]:
             here = table.model_copy(update={"file": study.path(table.file)})
             width = read_indenter(here, (0.0, 0.0, 0.0), (0.0, 0.0, -1.0), None).width
             yield f"indenter{'' if name is None else ' ' + name}: {table.file}, {width:.1f} mm wide"
-
-
-def _describe_record(name: str, record: TraceFacts) -> str:
-    return (
-        f"site {name}: peak force {record.peak_force_N:.2f} N at {record.depth_mm:.2f} mm, "
-        f"touch-down after {record.touch_down_mm:.2f} +- {record.touch_down_uncertainty_mm:.2f} "
-        f"mm; {record.phases_in_words}"
-        + ("" if record.speed_unload_mm_s is not None else "; loading only, no unloading")
-    )
 
 
 def _describe_fit(study: Study) -> Iterator[str]:

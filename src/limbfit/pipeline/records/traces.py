@@ -9,7 +9,7 @@ import numpy as np
 from ...errors import TraceError
 from ...phases import MotionPhase, describe_phases
 from ...results import limb as stored
-from ...study import Record, Study
+from ...study import Record, Study, TracesTable
 from ...traces import (
     Creep,
     LayerThinning,
@@ -48,14 +48,23 @@ class SecondaryMeasurement(NamedTuple):
 
 def read_record(study: Study, record: Record) -> tuple[Trace, RegularisedCurve, stored.TraceFacts]:
     """A record as it is used, its regularised curves and the facts that ``traces.json`` holds."""
-    table = study.traces
-    file = study.path(record.trace)
+    return read_trace_file(study.path(record.trace), study.traces, record)
+
+
+def read_trace_file(
+    file: Path, table: TracesTable, record: Record | None = None
+) -> tuple[Trace, RegularisedCurve, stored.TraceFacts]:
+    """What `read_record` returns, of any file; without a ``record`` the displacement was stated.
+
+    Raises `TraceError` for a file that is no record, or one that cannot be used.
+    """
     trace = read_trace(file, (table.time_s, table.displacement_mm, table.force_N))
+    forced = record is not None and record.forced
     with name_file_in_errors(file):
-        known = interpret_record(trace, record.touch_down_s, forced=record.forced)
+        known = interpret_record(trace, None if record is None else record.touch_down_s, forced=forced)
         trace, touch = known.trace, known.touch_down
-        made = regularise_creep if record.forced else regularise
-        smooth = made(trace, touch, table.smoothing, record.peak_s)
+        made = regularise_creep if forced else regularise
+        smooth = made(trace, touch, table.smoothing, None if record is None else record.peak_s)
     phases = [phase.later(touch.time_s) for phase in smooth.phases]
     first_s, first_mm = float(trace.time_s[0]), float(trace.displacement_mm[0]) - touch.displacement_mm
     if touch.time_s > first_s:
@@ -65,8 +74,8 @@ def read_record(study: Study, record: Record) -> tuple[Trace, RegularisedCurve, 
         cause, remedy = "the format of the rig's export", "compare the phases with what the rig did"
         remarks.insert(0, TraceWarning("reading", "; ".join(trace.notes), cause, remedy, {}))
     facts = stored.TraceFacts(
-        site=record.site.name,
-        control=record.control,
+        site=file.stem if record is None else record.site.name,
+        control="displacement" if record is None else record.control,
         touch_down_s=touch.time_s,
         touch_down_mm=touch.displacement_mm,
         touch_down_uncertainty_mm=touch.uncertainty_mm,
@@ -84,6 +93,16 @@ def read_record(study: Study, record: Record) -> tuple[Trace, RegularisedCurve, 
         remarks=[stored.RecordRemark.model_validate(remark) for remark in remarks],
     )
     return trace, smooth, facts
+
+
+def describe_record(record: stored.TraceFacts) -> str:
+    """A record in a line: force, depth, touch-down and phases."""
+    return (
+        f"peak force {record.peak_force_N:.2f} N at {record.depth_mm:.2f} mm, "
+        f"touch-down after {record.touch_down_mm:.2f} +- {record.touch_down_uncertainty_mm:.2f} "
+        f"mm; {record.phases_in_words}"
+        + ("" if record.speed_unload_mm_s is not None else "; loading only, no unloading")
+    )
 
 
 def run_traces(context: Context, folder: Path) -> None:
