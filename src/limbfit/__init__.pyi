@@ -76,6 +76,7 @@ from .pipeline.commands.demo import (
     run_demo as run_demo,
 )
 from .pipeline.commands.doctor import diagnose as diagnose
+from .pipeline.commands.inputs import list_inputs as list_inputs
 from .pipeline.commands.other_solvers import export_study as export_study
 from .pipeline.commands.models import (
     compare_models as compare_models,
@@ -128,3 +129,7 @@ from .shapes import (
 from .studio.server import serve_studio as serve_studio
 from .study.loading import load_study as load_study
 from .study.study import Study as Study
+from .study.writing import (
+    NewStudy as NewStudy,
+    create_study as create_study,
+)

@@ -234,11 +234,12 @@ def test_no_door(folder: Path) -> None:
     assert "either [image] or [surfaces]" in refusal(write(folder, text))
 
 
-def test_no_site(folder: Path) -> None:
-    text = GOOD[: GOOD.index("[[sites]]")]
-    assert re.search(r"sites: .*required", refusal(write(folder, text)))
-    text = "sites = []\n" + text
-    assert "sites: the study has no site" in refusal(write(folder, text))
+@pytest.mark.parametrize("begin", ["", "sites = []\n"])
+def test_a_study_without_sites_is_read_and_goes_as_far_as_its_surfaces(folder: Path, begin: str) -> None:
+    study = load_study(write(folder, begin + GOOD[: GOOD.index("[[sites]]")]))
+    for refused in (study.refuse_no_site, lambda: study.site("1"), lambda: study.indentation("1")):
+        with pytest.raises(StudyError, match=r"sites: the study has no site yet; add \[\[sites\]\]"):
+            refused()
 
 
 def test_missing_markers_and_labels(folder: Path) -> None:

@@ -12,7 +12,7 @@ import socket
 import time
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Protocol
 
 from ..errors import InputError, RunError
 from . import line_protocol as wire
@@ -155,6 +155,33 @@ def connect(address: str, timeout_s: float = 5.0) -> Link:
     )
 
 
+class Device(Protocol):
+    """What a session needs of a device; times are s of the caller's clock.
+
+    ``resolution_mN`` is the step of a force sensor too coarse to show its noise; 0: it shows it. Its methods
+    raise `RunError` where the device is gone.
+    """
+
+    identity: wire.Identity
+    resolution_mN: int
+
+    @property
+    def refusals(self) -> wire.Refusals:
+        """Lines that were refused."""
+
+    def send(self, command: wire.Command, now: float) -> None:
+        """Give a command."""
+
+    def receive(self, timeout_s: float = 0.0) -> list[wire.Notice]:
+        """Return what the device says, in order."""
+
+    def resend(self, now: float) -> str:
+        """Repeat what went unanswered; returns what to stop for, or nothing."""
+
+    def close(self) -> None:
+        """End."""
+
+
 @dataclass
 class _PendingCommand:
     command: wire.Command
@@ -169,6 +196,8 @@ class LineDevice:
     newer one for the same pin is not. Raises `RunError` where nobody answers, or it is another version, has
     other pins or another rate than limbfit knows; from each of its methods, where the device is gone.
     """
+
+    resolution_mN = 0
 
     def __init__(self, link: Link) -> None:
         self._link, self._nonce = link, secrets.token_hex(8)

@@ -290,7 +290,8 @@ class Identity(Message, verb="ID"):
     """What a device says of itself when greeted.
 
     ``clock`` is ``real``, or ``paced``: the device's time waits for limbfit, which then lives by it.
-    ``touch_fF`` is the capacitance of a head that touches skin; ``calibrated`` the day of its calibration.
+    ``touch_fF`` is the capacitance of a head that touches skin (0: heads have none, the force alone tells);
+    ``calibrated`` the day of its calibration.
     """
 
     version: Positive
@@ -299,7 +300,7 @@ class Identity(Message, verb="ID"):
     rate_hz: Positive
     stroke_um: Positive
     range_mN: Positive
-    touch_fF: Positive
+    touch_fF: Whole
     clock: Clock
     model: Word
     serial: Word

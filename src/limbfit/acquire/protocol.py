@@ -10,7 +10,7 @@ from enum import Enum, StrEnum
 
 from ..study import AcquireTable
 from . import line_protocol as wire
-from .line_protocol import PINS, RATE_HZ, Flags, Sample, to_thousandths
+from .line_protocol import PINS, Flags, Sample, to_thousandths
 from .safety import ClampWatch, Guard, check_device_flags, check_sensitivity, make_session_limits
 
 COMMAND_DELAY_S = 0.05  # a pin may stand still for so long before a command reaches it
@@ -103,7 +103,7 @@ CLAMPED = frozenset(
 
 _PROTOCOL_STEPS: dict[Phase, tuple[Phase, ...]] = {
     Phase.IDLE: (Phase.POSITION,),
-    Phase.POSITION: (Phase.CLAMP,),
+    Phase.POSITION: (Phase.CLAMP, Phase.SETTLE),  # a device of one pin holds no limb
     Phase.CLAMP: (Phase.SETTLE,),
     Phase.SETTLE: (Phase.APPROACH, Phase.CLAMP),  # once more where the limb has slackened
     Phase.APPROACH: (Phase.BACK,),
@@ -115,7 +115,7 @@ _PROTOCOL_STEPS: dict[Phase, tuple[Phase, ...]] = {
     Phase.LOAD: (Phase.UNLOAD, Phase.DWELL),
     Phase.DWELL: (Phase.UNLOAD,),
     Phase.UNLOAD: (Phase.LOAD, Phase.PAUSE, Phase.RETRACT),
-    Phase.RETRACT: (Phase.RELEASE,),
+    Phase.RETRACT: (Phase.RELEASE, Phase.DONE),
     Phase.RELEASE: (Phase.DONE,),
 }
 # A stop is possible everywhere but where it has happened or nothing is left to stop.
@@ -130,16 +130,20 @@ class Protocol:
     Attributes
     ----------
     phase : where the session is; ``reason``: why it was stopped, empty where it was not.
+    clamps : the pins that hold the limb; none where the device has one pin.
     touch_um, start_um, depth_um : positions of the test pin, as they are found.
     cycle : ramps begun so far, those of preconditioning included.
+
+    ``resolution_mN`` is the step of a force sensor too coarse to show its noise; 0: it shows it.
     """
 
-    def __init__(self, settings: Settings, device: wire.Identity) -> None:
+    def __init__(self, settings: Settings, device: wire.Identity, resolution_mN: int = 0) -> None:
         self.settings, self.device = settings, device
         self.phase, self.reason = Phase.IDLE, ""
         self.touch_um = self.start_um = self.depth_um = self.cycle = 0
-        self.guard = Guard(make_session_limits(settings, device.stroke_um, device.range_mN, RATE_HZ))
-        self._clamp_watch = ClampWatch(settings.clamps)
+        self.clamps = settings.clamps if device.pins > 1 else ()
+        self.guard = Guard(make_session_limits(settings, device, resolution_mN))
+        self._clamp_watch = ClampWatch(self.clamps)
         self._phase_start_s = self._last_sample_s = 0.0
         self._rounds = 0
         self._is_confirmed = False
@@ -201,14 +205,16 @@ class Protocol:
         """Check the limits that hold in some phases only."""
         if self.phase in CLAMPED and (wrong := self._clamp_watch.check(sample)):
             return wrong
-        pin = self.settings.pin
+        pin, touch_mN = self.settings.pin, to_thousandths(self.settings.touch_N)
+        if self.phase is Phase.APPROACH and self._compute_net_force(sample) < -touch_mN:
+            return f"pin {pin} feels a pull as it comes near the skin: the sign of its force is reversed"
         if self.phase is Phase.APPROACH and self._contact_um is not None:
             force_mN, travel = self._compute_net_force(sample), sample.position_um[pin - 1] - self._contact_um
         elif self.phase is Phase.SEARCH:  # the first push: on a ramp the tissue may not be back yet
             force_mN, travel = self._compute_net_force(sample), sample.position_um[pin - 1] - self.touch_um
         else:
             return ""
-        return check_sensitivity(travel, force_mN, to_thousandths(self.settings.touch_N) // 2, pin)
+        return check_sensitivity(travel, force_mN, touch_mN // 2, pin)
 
     def _check_time(self, now: float) -> tuple[wire.Action, ...]:
         """Stop, or give up, where a phase takes longer than it may."""
@@ -260,7 +266,7 @@ class Protocol:
                 self._rounds += 1
                 speed = to_thousandths(settings.clamp_speed_mm_s / (1 if self._rounds == 1 else 5))
                 halt = to_thousandths(settings.clamp_N)
-                return tuple(wire.Move(pin, stroke_um, speed, halt) for pin in settings.clamps)
+                return tuple(wire.Move(pin, stroke_um, speed, halt) for pin in self.clamps)
             case Phase.APPROACH:
                 self._contact_um = None
                 halt = self._compute_tare() + to_thousandths(settings.touch_N)
@@ -281,7 +287,7 @@ class Protocol:
             case Phase.RETRACT:
                 return self._drive_home((settings.pin,))
             case Phase.RELEASE:
-                return self._drive_home(settings.clamps)
+                return self._drive_home(self.clamps)
             case Phase.STOPPING:
                 return (wire.Stop(self.reason),)
         return ()
@@ -312,8 +318,8 @@ class Protocol:
         is_home = bool(sample.flags & Flags.HOME)
         match self.phase:
             case Phase.POSITION if self._is_confirmed and is_home:
-                return Phase.CLAMP
-            case Phase.CLAMP if self._is_at_rest(sample, now, settings.clamps):
+                return Phase.CLAMP if self.clamps else Phase.SETTLE
+            case Phase.CLAMP if self._is_at_rest(sample, now, self.clamps):
                 return Phase.SETTLE
             case Phase.SETTLE:
                 return self._find_phase_after_settling(sample, now)
@@ -338,7 +344,7 @@ class Protocol:
                     return Phase.RETRACT
                 return Phase.LOAD if self.cycle < settings.precondition else Phase.PAUSE
             case Phase.RETRACT if self._has_arrived(sample, now, 0):
-                return Phase.RELEASE
+                return Phase.RELEASE if self.clamps else Phase.DONE
             case Phase.RELEASE if is_home and passed_s > COMMAND_DELAY_S:
                 return Phase.DONE
             case Phase.STOPPING if sample.flags & Flags.GIVEN_UP:
@@ -351,8 +357,10 @@ class Protocol:
         self._tare_samples.append(sample.force_mN[self.settings.pin - 1])
         if now - self._phase_start_s < self.settings.settle_s:
             return None
+        if not self.clamps:
+            return Phase.APPROACH
         least = to_thousandths(self.settings.clamp_N - self.settings.clamp_tolerance_N)
-        force, pin = min((sample.force_mN[pin - 1], pin) for pin in self.settings.clamps)
+        force, pin = min((sample.force_mN[pin - 1], pin) for pin in self.clamps)
         if force >= least:
             return Phase.APPROACH
         if self._rounds < MAX_CLAMP_ROUNDS:
@@ -361,12 +369,14 @@ class Protocol:
 
     def _find_phase_after_approach(self, sample: Sample, now: float) -> Phase | None:
         pin = self.settings.pin
-        touches = sample.capacitance_fF[pin - 1] >= self.device.touch_fF
+        is_felt = self._compute_net_force(sample) >= to_thousandths(self.settings.touch_N) // 2
+        touches = is_felt
+        if self.device.touch_fF:
+            touches = sample.capacitance_fF[pin - 1] >= self.device.touch_fF
         if touches and self._contact_um is None:
             self._contact_um = sample.position_um[pin - 1]
         if not self._is_at_rest(sample, now, (pin,)):
             return None
-        is_felt = self._compute_net_force(sample) >= to_thousandths(self.settings.touch_N) // 2
         if is_felt and self._contact_um is not None:
             self.touch_um = self._contact_um
             self.start_um = max(self.touch_um - to_thousandths(self.settings.start_gap_mm), 0)

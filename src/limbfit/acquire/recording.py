@@ -32,7 +32,7 @@ import numpy as np
 from ..arrays import Indices
 from ..errors import RunError, TraceError, add_location
 from ..traces import RegularisedCurve, Trace, find_touch_down, regularise
-from .line_protocol import PERIOD_US, PINS, Sample
+from .line_protocol import PINS, Sample
 
 FIRST_LINE = "#limbfit-recording 1"
 ROWS_PER_BLOCK = 25  # per block: 50 ms
@@ -43,7 +43,6 @@ _HEAD_BYTES = 1 << 16  # the first block and a closing line are shorter than the
 _CLOSING_BYTES = 64
 _NAMES = ("host_us", "device_us", "number", "flags", "moving")
 _CHANNELS = (("p", "um"), ("f", "mN"), ("c", "fF"))  # position, force, capacitance
-COLUMNS = (*_NAMES, *(f"{letter}{pin}_{unit}" for letter, unit in _CHANNELS for pin in range(1, PINS + 1)))
 _CLOSING = re.compile(rb"#block ([0-9]{1,9}) ([0-9]{1,9}) ([0-9A-F]{8})\n")
 SPEED_TOLERANCE = 0.5 / 0.96  # of the ramp's speed; paper, section 2.1.2: 0.96 +- 0.5 mm/s
 MAX_TOUCH_SD_MM = 0.3
@@ -53,6 +52,12 @@ MAX_LOST_PERCENT = 0.1
 REST_US = 200_000  # of rest on either side of a ramp that belongs to its record
 
 
+def list_columns(pins: int) -> tuple[str, ...]:
+    """The columns of a record of a device with so many pins."""
+    channels = (f"{letter}{pin}_{unit}" for letter, unit in _CHANNELS for pin in range(1, pins + 1))
+    return (*_NAMES, *channels)
+
+
 class Recorder:
     """Writes a session's record; rows are given in one thread, and written in another. Raises `RunError` from
     `sample` or `close`, once the file could not be written (a full disk).
@@ -60,7 +65,8 @@ class Recorder:
 
     def __init__(self, file: Path, head: dict[str, Any]) -> None:
         self.file = file
-        self._lines = [FIRST_LINE, f"#head {json.dumps(head, allow_nan=False)}", ",".join(COLUMNS)]
+        self._lines = [FIRST_LINE, f"#head {json.dumps(head, allow_nan=False)}"]
+        self._lines.append(",".join(list_columns(head["device"]["pins"])))
         self._rows = self._index = self._crc = 0
         self._failed = ""
         self._finished_blocks: SimpleQueue[bytes | None] = SimpleQueue()
@@ -117,7 +123,7 @@ class Recorder:
 
 @dataclass(frozen=True)
 class Recording:
-    """A record that was read: one row per sample; (n,) or (n, 14) integers in the units of `line_protocol`.
+    """A record that was read: one row per sample; (n,) or (n, pins) integers in units of `line_protocol`.
 
     ``lost_bytes`` stand after the last block that is whole.
     """
@@ -253,22 +259,23 @@ def _parse_content(content: bytes, lost_bytes: int, every: int = 1) -> Recording
         raise TraceError("it has a line that no record holds") from None
     if not isinstance(head, dict):
         raise TraceError("its head is not a table")
-    table = _read_table(rows[every - 1 :: every])
+    columns = len(list_columns(head.get("device", {}).get("pins", PINS)))
+    table = _read_table(rows[every - 1 :: every], columns)
     host_us, device_us, number, flags, moving = table[:, : len(_NAMES)].T
     position, force, capacitance = np.split(table[:, len(_NAMES) :], 3, axis=1)
     series = host_us, device_us, number, flags, moving, position, force, capacitance
     return Recording(head, tuple(events), *series, lost_bytes)
 
 
-def _read_table(rows: list[str]) -> Indices:
+def _read_table(rows: list[str], columns: int) -> Indices:
     if not rows:
-        return np.zeros((0, len(COLUMNS)), dtype=np.int64)
+        return np.zeros((0, columns), dtype=np.int64)
     try:
         table = np.loadtxt(io.StringIO("\n".join(rows)), delimiter=",", dtype=np.int64, ndmin=2)
     except (ValueError, OverflowError):
         raise TraceError("its rows are not integers in columns") from None
-    if table.shape[1] != len(COLUMNS):
-        raise TraceError(f"{table.shape[1]} columns instead of {len(COLUMNS)}")
+    if table.shape[1] != columns:
+        raise TraceError(f"{table.shape[1]} columns instead of {columns}")
     return table
 
 
@@ -422,8 +429,8 @@ def _check_saturation(recording: Recording) -> Check:
 
 
 def _check_losses(recording: Recording) -> Check:
-    steps = np.diff(recording.device_us)
-    lost = int(np.maximum(np.rint(steps / PERIOD_US) - 1, 0).sum()) if steps.size else 0
+    steps = np.diff(recording.device_us) * (int(recording.head["device"]["rate_hz"]) / 1e6)
+    lost = int(np.maximum(np.rint(steps) - 1, 0).sum()) if steps.size else 0
     share = 100 * lost / max(len(recording.device_us) + lost, 1)
     found = f"{lost} of {len(recording.device_us) + lost} samples never came"
     return Check(

@@ -8,7 +8,7 @@ from collections import deque
 from dataclasses import dataclass, replace
 
 from ..study import AcquireTable
-from .line_protocol import PINS, Flags, Sample, to_thousandths
+from .line_protocol import Flags, Identity, Sample, to_thousandths
 
 FROZEN_S = 0.010  # a sensor whose last digit has not changed for so long, and so many samples, is dead
 FROZEN_SAMPLES = 8
@@ -19,13 +19,15 @@ MIN_CLAMP_MN = 500  # a clamping pin that pushes less has lost the limb
 MAX_CLAMP_JUMP_MN = 3000  # and so has one whose force changes by more, within the time below
 CLAMP_JUMP_US = 200_000
 MAX_UNFELT_TRAVEL_UM = 1500  # a push so far beyond touch must be felt
+CONTACT_STEPS = 3  # of a coarse sensor: a force that is contact, and not its last digit
 
 
 @dataclass(frozen=True)
 class SafetyLimits:
     """Per pin: largest force (mN) and position (um).
 
-    For all: speed towards the limb (um/s), sensor range (mN), and how often a live sensor may repeat itself.
+    For all: speed towards the limb (um/s), sensor range (mN), how often a live sensor may repeat itself, and
+    the step of a sensor that is too coarse to show its noise (mN; 0: it shows it).
     """
 
     force_mN: tuple[int, ...]
@@ -33,6 +35,7 @@ class SafetyLimits:
     speed_um_s: int
     range_mN: int
     max_unchanged_samples: int
+    resolution_mN: int = 0
 
 
 @dataclass(frozen=True)
@@ -44,16 +47,21 @@ class Violation:
     text: str
 
 
-def make_session_limits(settings: AcquireTable, stroke_um: int, range_mN: int, rate_hz: int) -> SafetyLimits:
-    """The limits of a session before the skin has been met; see `Guard.set_depth`."""
-    force = [to_thousandths(settings.clamp_limit_N)] * PINS
+def make_session_limits(settings: AcquireTable, device: Identity, resolution_mN: int = 0) -> SafetyLimits:
+    """The limits of a session before the skin has been met; see `Guard.set_depth`.
+
+    A sensor whose step ``resolution_mN`` hides its noise may repeat itself: of it is asked that it changes
+    while the pin travels in contact.
+    """
+    force = [to_thousandths(settings.clamp_limit_N)] * device.pins
     force[settings.pin - 1] = to_thousandths(settings.force_limit_N)
     return SafetyLimits(
         force_mN=tuple(force),
-        position_um=(stroke_um,) * PINS,
+        position_um=(device.stroke_um,) * device.pins,
         speed_um_s=to_thousandths(settings.speed_limit_mm_s),
-        range_mN=range_mN,
-        max_unchanged_samples=max(round(FROZEN_S * rate_hz), FROZEN_SAMPLES),
+        range_mN=device.range_mN,
+        max_unchanged_samples=max(round(FROZEN_S * device.rate_hz), FROZEN_SAMPLES),
+        resolution_mN=resolution_mN,
     )
 
 
@@ -65,7 +73,8 @@ class Guard:
         self._lowest_limit_mN = min(*limits.force_mN, limits.range_mN - 1)
         self._recent_samples: deque[Sample] = deque()
         self._last_forces: tuple[int, ...] = ()
-        self._unchanged_samples = [0] * PINS
+        self._unchanged_samples = [0] * len(limits.force_mN)
+        self._changed_at_um: list[int] = []  # where each pin was when its force last changed
 
     def set_depth(self, pin: int, position_um: int) -> None:
         """From now on a pin may not go beyond a position."""
@@ -113,7 +122,9 @@ class Guard:
         return None
 
     def _check_frozen_sensors(self, sample: Sample) -> Violation | None:
-        """Find a sensor that repeats itself: a live one is noisy."""
+        """Find a sensor that repeats itself: a live one is noisy, or changes as its pin travels in contact."""
+        if self.limits.resolution_mN:
+            return self._check_coarse_sensors(sample)
         if self._last_forces:
             unchanged = self._unchanged_samples
             for k, (now, then) in enumerate(zip(sample.force_mN, self._last_forces, strict=True)):
@@ -123,6 +134,18 @@ class Guard:
                     text = f"the force sensor of pin {k + 1} is dead: it repeats itself"
                     return Violation("dead", k + 1, text)
         self._last_forces = sample.force_mN
+        return None
+
+
+    def _check_coarse_sensors(self, sample: Sample) -> Violation | None:
+        last, places = self._last_forces or sample.force_mN, self._changed_at_um or list(sample.position_um)
+        self._last_forces, self._changed_at_um = sample.force_mN, places
+        for k, (now, then) in enumerate(zip(sample.force_mN, last, strict=True)):
+            if now != then or now < CONTACT_STEPS * self.limits.resolution_mN:
+                places[k] = sample.position_um[k]
+            elif abs(sample.position_um[k] - places[k]) > MAX_UNFELT_TRAVEL_UM:
+                text = f"the force sensor of pin {k + 1} is dead: it shows the same over "
+                return Violation("dead", k + 1, f"{text}{MAX_UNFELT_TRAVEL_UM / 1000:g} mm in contact")
         return None
 
 

@@ -17,8 +17,8 @@ from typing import Any
 
 from ..errors import RunError
 from . import line_protocol as wire
-from .device import LineDevice
-from .line_protocol import PERIOD_US, Sample, to_thousandths
+from .device import Device
+from .line_protocol import Sample, to_thousandths
 from .protocol import Abort, Event, LinkLoss, Phase, Protocol, Settings, Signal
 from .recording import Recorder
 
@@ -85,14 +85,15 @@ class Session:
     def __init__(
         self,
         settings: Settings,
-        device: LineDevice,
+        device: Device,
         *,
         site: str,
         recorder: Recorder | None = None,
         listener: Listener | None = None,
     ) -> None:
         self.settings, self.device, self.recorder, self.listener = settings, device, recorder, listener
-        self.protocol = Protocol(settings, device.identity)
+        self.protocol = Protocol(settings, device.identity, device.resolution_mN)
+        self._period_us = 1_000_000 // device.identity.rate_hz
         self.samples = self.lost = 0
         self.unreachable: tuple[int, ...] = ()
         self._site = site
@@ -170,7 +171,7 @@ class Session:
             self.recorder.sample(sample, round(now * 1e6))
         self.samples += 1
         if self._last_sample is not None:
-            self.lost += max((sample.time_us - self._last_sample.time_us) // PERIOD_US - 1, 0)
+            self.lost += max((sample.time_us - self._last_sample.time_us) // self._period_us - 1, 0)
         self._last_sample = sample
         lead = now - sample.time_us / 1e6
         self._smallest_lead_s = min(self._smallest_lead_s + CLOCK_DRIFT_S, lead)
@@ -182,7 +183,7 @@ class Session:
 
     def _make_live_update(self, sample: Sample, now: float) -> LiveUpdate:
         k = self.settings.pin - 1
-        clamps = [sample.force_mN[pin - 1] for pin in self.settings.clamps]
+        clamps = [sample.force_mN[pin - 1] for pin in self.protocol.clamps] or [0]
         return LiveUpdate(
             phase=str(self.protocol.phase),
             time_s=now,

@@ -15,11 +15,11 @@ from typer.core import TyperGroup
 from .._version import __version__
 from ..errors import InputError, LimbfitError
 from ..execution import SAFE_PATH
-from . import acquire, bench, commands, experiments, febio, population, runs, shapes, socket
+from . import acquire, bench, commands, experiments, febio, init, population, runs, shapes, socket
 from .console import INTERRUPTED, fail, print_line, prompt_interrupt
 
 GROUPS: Mapping[str, tuple[str, ...]] = {
-    "Patient": ("demo", "phantom", "series", "check", "segment", "surfaces", "sites", "mesh"),
+    "Patient": ("demo", "phantom", "init", "series", "check", "segment", "surfaces", "sites", "mesh"),
     "Identify": ("run", "status", "report", "simulate", "batch", "reproduce"),
     "Trust": ("uncertainty", "crossvalidate", "regions", "sensitivity", "cube", "experiment"),
     "Socket": ("socket", "population", "shapes"),
@@ -59,7 +59,7 @@ def root(version: Annotated[bool, Option("--version", help="print the version an
 
 
 _WITH_JOBS = {commands.run, commands.demo, *experiments.VERBS}
-for verb in (*commands.VERBS, *experiments.VERBS, *febio.VERBS, *runs.VERBS, *acquire.VERBS):
+for verb in (*commands.VERBS, *init.VERBS, *experiments.VERBS, *febio.VERBS, *runs.VERBS, *acquire.VERBS):
     app.command()(runs.add_execution_options(verb) if verb in _WITH_JOBS else verb)
 app.add_typer(socket.app, name="socket")
 app.add_typer(population.app, name="population")

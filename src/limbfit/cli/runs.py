@@ -120,7 +120,7 @@ def studio(
     host: Annotated[str, Option(help="the address to listen on")] = "127.0.0.1",
     expose: Annotated[bool, Option("--expose", help="let other machines reach and change the study")] = False,
 ) -> None:
-    """View and correct the limb, and watch its identification, in a browser on this machine."""
+    """Make a study, view and correct the limb, and watch its identification, in a browser on this machine."""
 
     def tell(address: str) -> None:
         console.print_line(f"studio of {study}; Ctrl-C ends it, runs go on")

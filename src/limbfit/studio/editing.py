@@ -4,9 +4,6 @@ Every change is made on the text, written beside the file, read back as a study,
 place: a change that the study file's own checks refuse leaves the file as it was.
 """
 
-import os
-import shutil
-import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -18,7 +15,8 @@ from tomlkit.exceptions import TOMLKitError
 from tomlkit.items import AoT
 
 from ..errors import StudyError
-from ..study import Record, load_study
+from ..study import Record
+from ..study.writing import store_study
 
 POSITION_DIGITS = 2  # of a place in mm
 _LOCK = Lock()  # requests come in threads: each change is made on what the one before it stored
@@ -37,25 +35,7 @@ def edit_study(file: Path) -> Iterator[tomlkit.TOMLDocument]:
         except (TOMLKitError, UnicodeDecodeError) as error:
             raise StudyError(f"not valid TOML: {error}", file=file) from None
         yield document
-        _store(document, file)
-
-
-def _store(document: tomlkit.TOMLDocument, file: Path) -> None:
-    """Put the document in the place of the study file, where it is a valid study."""
-    handle, name = tempfile.mkstemp(prefix=".study-", suffix=".toml", dir=file.parent)
-    written = Path(name)
-    try:
-        with os.fdopen(handle, "w", encoding="utf-8") as stream:
-            text = tomlkit.dumps(document)
-            stream.write(text if text.endswith("\n") else f"{text}\n")
-        try:
-            load_study(written, recorded=False)
-        except StudyError as error:
-            raise StudyError(error.what, file=file, place=error.place, remedy=error.remedy) from None
-        shutil.copymode(file, written)
-        written.replace(file)
-    finally:
-        written.unlink(missing_ok=True)
+        store_study(document, file)
 
 
 def set_site(file: Path, site: str, values: Mapping[str, Any]) -> None:
@@ -84,7 +64,7 @@ def set_record(file: Path, record: Record, values: Mapping[str, Any]) -> None:
 def add_site(file: Path, name: str, position: Sequence[float], values: Mapping[str, Any]) -> None:
     """Append a site at a place (LPS, mm) with more keys: ``depth_mm``, ``region``."""
     with edit_study(file) as document:
-        sites = document.get("sites")
+        sites = document.setdefault("sites", tomlkit.aot())
         if not isinstance(sites, list):
             raise StudyError("the study has no [[sites]] to add to", file=file, place="sites")
         _append(sites, {"name": name, "position": position, **values})

@@ -37,6 +37,11 @@ class StudyFolder:
         """The logs of runs, the newest last."""
         return sorted((self.results / "log").glob("*.jsonl"))
 
+    @property
+    def is_new(self) -> bool:
+        """True where there is no study file yet."""
+        return not self.file.is_file()
+
     def load(self) -> Study:
         """The study as its file now states it; its records need not exist yet."""
         return load_study(self.file, recorded=False)
@@ -64,16 +69,21 @@ class StudyFolder:
 
 def resolve_inside(root: Path, *parts: str) -> Path:
     """The path of a file below ``root``, given by its parts; see `StudyFolder.artefact` for the errors."""
-    for part in parts:
-        is_plain = bool(part) and part.isprintable() and not set(part) & set('/\\:*?"<>|')
-        if not is_plain or part.startswith("."):
-            raise InputError("not the name of a file of the study", remedy="names have no path in them")
+    check_parts(parts)
     path = root.joinpath(*parts)
     if not path.resolve().is_relative_to(root.resolve()):
         raise InputError(f"the file lies outside of {root.name}")
     if not path.is_file():
         raise FileNotFoundError("/".join(parts))
     return path
+
+
+def check_parts(parts: Iterable[str]) -> None:
+    """Refuse a path by its parts where one is no plain name; raises `InputError`."""
+    for part in parts:
+        is_plain = bool(part) and part.isprintable() and not set(part) & set('/\\:*?"<>|')
+        if not is_plain or part.startswith("."):
+            raise InputError("not the name of a file of the study", remedy="names have no path in them")
 
 
 def compute_fingerprint(files: Iterable[Path]) -> str:

@@ -3,17 +3,19 @@
 import tomllib
 from collections.abc import Sequence
 from functools import lru_cache
+from itertools import count
 from typing import Annotated
 
 import numpy as np
-from fastapi import APIRouter, Response
+from fastapi import APIRouter, Body, Response
 from pydantic import Field
 
-from ..anatomy.sites.sites import project_to_skin
-from ..anatomy.surfaces.surfaces import Anatomy, load_anatomy
+from ..anatomy.sites.sites import find_markers, project_to_skin
+from ..anatomy.surfaces.surfaces import Anatomy, load_anatomy, read_surface
 from ..errors import InputError, SiteError
 from ..mesh import read_vtu
 from ..pipeline.engine.digests import compute_digest
+from ..pipeline.engine.store import MARKED_SKIN
 from ..pipeline.limb.sites import place_site
 from ..pipeline.limb.surfaces import read_given_anatomy
 from ..results.limb import MeshResult, PlacedSite, SitesResult
@@ -25,6 +27,7 @@ from .study_routes import Folder, StrictModel, respond_block
 
 router = APIRouter(prefix="/api/model")
 SKIN = "skin"
+MARKER_REACH_MM = 10.0  # of a site: a marker within it is that site's
 Coordinate = Annotated[float, Field(allow_inf_nan=False, ge=-1e5, le=1e5)]
 Place = Annotated[list[Coordinate], Field(min_length=3, max_length=3)]
 Text = Annotated[str, Field(max_length=200)]
@@ -106,6 +109,23 @@ def post_site(folder: Folder, site: NewSite) -> Json:
     position = project_to_skin_of_study(folder, site.position)
     region = {"region": site.region} if site.region else {}
     add_site(folder.file, site.name, position, {**region, "depth_mm": site.depth_mm})
+    return get_scene(folder)
+
+
+@router.post("/markers")
+def post_markers(folder: Folder, depth_mm: Annotated[float, Body(embed=True, gt=0, le=100)]) -> Json:
+    """Add a site at every marker on the skin that has none yet, highest first; returns the changed scene."""
+    study = folder.load()
+    anatomy, marked = read_anatomy(folder, study), folder.results / "segment" / MARKED_SKIN
+    if anatomy is None or not marked.is_file():
+        raise InputError(
+            "no skin with markers is known", remedy="state image.markers, and run until surfaces"
+        )
+    places = [site.position or site.near for site in study.sites]
+    numbers = (name for n in count(1) if (name := f"{n:02d}") not in {site.name for site in study.sites})
+    for marker in find_markers(read_surface(marked), anatomy.skin):
+        if all(np.linalg.norm(marker.position - place) > MARKER_REACH_MM for place in places if place):
+            add_site(folder.file, next(numbers), marker.position.tolist(), {"depth_mm": depth_mm})
     return get_scene(folder)
 
 

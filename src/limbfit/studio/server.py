@@ -45,7 +45,7 @@ def serve_studio(
 
     Parameters
     ----------
-    study : the study file or its folder.
+    study : the study file or its folder; in a folder without one the page makes a study.
     port : 0 takes a free one.
     host : the one address to listen on; another than this machine's own (127.0.0.1, ::1) needs ``expose``.
     expose : the study may be seen and changed by whoever reaches ``host`` and has the page's address.
@@ -61,7 +61,8 @@ def serve_studio(
     """
     path = Path(study).absolute()
     folder = StudyFolder(path / "study.toml" if path.is_dir() else path)
-    folder.load()
+    if not (path.is_dir() and folder.is_new):
+        folder.load()
     if not is_loopback(host) and not expose:
         remedy = "leave out --host, or say --expose to give the study to whoever has its address"
         raise InputError(f"{host} can be reached from other machines", remedy=remedy)

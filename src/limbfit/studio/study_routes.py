@@ -47,8 +47,17 @@ def respond_block(arrays: Mapping[str, Any], facts: Mapping[str, Any] | None = N
 @router.get("/study")
 def get_study(folder: Folder) -> Json:
     """The name of the study, its sites, and its records and planned indentations, without paths of inputs."""
+    if folder.is_new:
+        return {
+            "is_new": True,
+            "name": folder.folder.name,
+            "has_image": False,
+            "sites": [],
+            "indentations": [],
+        }
     study = folder.load()
     return {
+        "is_new": False,
         "name": study.study.name,
         "has_image": study.image is not None,
         "sites": [{"name": site.name} for site in study.sites],
@@ -63,7 +72,7 @@ def get_study(folder: Folder) -> Json:
 @router.get("/stages")
 def get_stages(folder: Folder) -> Json:
     """The state of every stage, as ``limbfit status`` reports it, and the current run, if any."""
-    return {"stages": list_stages(folder), "run": find_running(folder)}
+    return {"stages": [] if folder.is_new else list_stages(folder), "run": find_running(folder)}
 
 
 @router.get("/changes")

@@ -11,13 +11,13 @@ from ..anatomy.surfaces.surfaces import load_anatomy
 from ..arrays import Array
 from ..errors import InputError
 from ..pipeline.records.record_checks import record_flags
-from ..pipeline.records.traces import read_record
+from ..pipeline.records.traces import read_record, read_trace_file
 from ..results.identification import PredictResult
 from ..results.limb import SitesResult, TraceFacts
 from ..study import Record, Study
 from ..traces.numerics import average_in_bins
-from .editing import set_record
-from .folder import Json, StudyFolder, compute_fingerprint
+from .editing import set_record, set_site
+from .folder import Json, StudyFolder, compute_fingerprint, resolve_inside
 from .study_routes import Folder, StrictModel, list_stage_states
 
 router = APIRouter(prefix="/api/traces")
@@ -31,6 +31,13 @@ class Times(StrictModel):
 
     touch_down_s: float | None = None
     peak_s: float | None = None
+
+
+class NewRecord(StrictModel):
+    """A file below the study's folder that becomes a site's record."""
+
+    path: str
+    fitted: bool
 
 
 @router.get("")
@@ -72,6 +79,17 @@ def post_times(folder: Folder, name: str, times: Times) -> Json:
     content = _read(folder, study, record).content
     set_record(folder.file, record, {"touch_down_s": record.touch_down_s, "peak_s": record.peak_s})
     return content
+
+
+@router.post("/{name}/record")
+def post_record(folder: Folder, name: str, given: NewRecord) -> Json:
+    """Make a file the record of a site, where it can be one; its facts."""
+    study = folder.load()
+    file = resolve_inside(folder.folder, *given.path.split("/"))
+    _, _, facts = read_trace_file(file, study.traces)
+    values = {"trace": given.path, "depth_mm": None, "speed_mm_s": None, "fitted": given.fitted}
+    set_site(folder.file, study.site(name).name, values)
+    return facts.to_plain()
 
 
 def _find_record(study: Study, name: str) -> Record:

@@ -198,7 +198,12 @@ UNUSED_KEYS: Rules = {
         "image.markers is a file, not a folder of series",
     ),
     ("image.markers",): UnusedKeys(
-        lambda s: s.image is not None and s.image.marked is not None and all(t.near is None for t in s.sites),
+        lambda s: (
+            s.image is not None
+            and s.image.marked is not None
+            and bool(s.sites)
+            and all(site.near is None for site in s.sites)
+        ),
         "no site is matched to a marker",
         "give near instead of position, or leave it out",
     ),
@@ -218,11 +223,11 @@ UNUSED_KEYS: Rules = {
     **_list_edge_rules("mesh", lambda s: s.mesh),
     **_list_edge_rules("mesh.coarse", lambda s: s.mesh.coarse),
     ("indenter",): UnusedKeys(
-        lambda s: all(one.indenter is not None for one in s.indentations),
+        lambda s: bool(s.sites) and all(one.indenter is not None for one in s.indentations),
         "every record and every planned indentation names another one",
     ),
     ("traces",): UnusedKeys(
-        lambda s: not s.recorded,
+        lambda s: bool(s.sites) and not s.recorded,
         "no site has a record",
         "give sites.trace, or leave it out",
     ),
@@ -375,7 +380,7 @@ def _find_unused_keys(study: Study, content: Mapping[str, Any]) -> Iterator[tupl
         why = "the parameter stays at its start"
         yield f"calibration.prior.{name}", why, "leave it out, or let the parameter move"
     tables: list[Site | RecordTable] = [*study.sites, *study.records]
-    for table, stated in zip(tables, (*content["sites"], *content.get("records", ())), strict=True):
+    for table, stated in zip(tables, (*content.get("sites", ()), *content.get("records", ())), strict=True):
         for keys, rule in (UNUSED_SITE_KEYS if isinstance(table, Site) else UNUSED_RECORD_KEYS).items():
             for key in keys:
                 if key in stated and rule.when(study, table):

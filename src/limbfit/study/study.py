@@ -41,7 +41,7 @@ class Study(tables.TomlFile):
     clamps: tables.ClampsTable | None = None
     traces: tables.TracesTable = tables.TracesTable()
     markups: tables.MarkupsTable | None = None
-    sites: tuple[Site, ...]
+    sites: tuple[Site, ...] = ()
     records: tuple[RecordTable, ...] = ()
     material: MaterialTable = MaterialTable()
     calibration: tables.CalibrationTable = tables.CalibrationTable()
@@ -208,11 +208,18 @@ class Study(tables.TomlFile):
         return indentation.trace is not None and self.path(indentation.trace).is_file()
 
     def site(self, name: str) -> Site:
+        self.refuse_no_site()
         known = {site.name: site for site in self.sites}
         if name in known:
             return known[name]
         remedy = f"the study has {', '.join(known)}"
         raise StudyError(f"no site is named {name!r}", file=self.file, place="sites", remedy=remedy)
+
+    def refuse_no_site(self) -> None:
+        """Raise `StudyError` where no site is stated yet: the study then goes as far as its surfaces."""
+        if not self.sites:
+            remedy = "add [[sites]], or place sites in limbfit studio"
+            raise StudyError("the study has no site yet", file=self.file, place="sites", remedy=remedy)
 
     def indentation(self, name: str) -> Indentation:
         """Return the record, or the planned indentation, of a name; a site with one record stands for it."""
@@ -229,8 +236,6 @@ class Study(tables.TomlFile):
     @field_validator("sites")
     @classmethod
     def _check_sites(cls, sites: tuple[Site, ...]) -> tuple[Site, ...]:
-        if not sites:
-            raise ValueError("the study has no site")
         if doubled := tables.find_repeated(site.name for site in sites):
             raise ValueError(f"site names must differ; given twice: {', '.join(doubled)}")
         return sites

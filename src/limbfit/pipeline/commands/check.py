@@ -109,6 +109,9 @@ def _describe_indenters(study: Study) -> Iterator[str]:
 
 def _describe_fit(study: Study) -> Iterator[str]:
     """How many sites and records are fitted, and with which priors."""
+    if not study.sites:
+        yield "the study has no site yet: add [[sites]], or place sites in limbfit studio"
+        return
     number = len(study.records_at(*study.fitted))
     more = f", with {number} records" if number > len(study.fitted) else ""
     yield f"{len(study.fitted)} of {len(study.sites)} sites are fitted{more}"

@@ -165,6 +165,8 @@ def check_experiment(
 
     Raises `InputError` with the remedy.
     """
+    if set(experiment.needs) - {"segment", "surfaces"}:
+        study.refuse_no_site()
     if "calibrate" in experiment.needs:
         check_fitted(study)
     if experiment.check is not None:

@@ -177,6 +177,8 @@ def run_study(
     listener : is told of progress; ``results/log`` too.
     """
     anew = select_stages_to_redo(study, until, start, force)
+    if until not in ("segment", "surfaces"):
+        study.refuse_no_site()
     with _open_run(study, "run", listener) as context:
         kept = keep_hand_labels(study)
         if kept is not None:

@@ -28,5 +28,7 @@ export const api = {
   bytes: async (path) => (await ask(path)).arrayBuffer(),
   post: async (path, body = {}) =>
     (await ask(path, { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(body) })).json(),
+  send: async (path, body) =>
+    (await ask(path, { method: "POST", headers: { "Content-Type": "application/octet-stream" }, body })).json(),
   url: (path) => `/api/${path}`,
 };

@@ -3,7 +3,7 @@
 // A view is a module `views/<name>.js` that exports
 //   mount(element, context)   builds the view in `element`; returns { show(), hide() }, of which none is needed
 // and is given
-//   context.api.get(path), .post(path, body), .bytes(path), .url(path)   paths below /api
+//   context.api.get(path), .post(path, body), .send(path, bytes), .bytes(path), .url(path)   paths below /api
 //   context.study             the study as GET /api/study tells it; always the newest
 //   context.stages, .run      rows of `limbfit status`, and the run that goes on or null
 //   context.on(listener)      listener({ study, stages, labels, log, acquired, run, theme }), true for what changed;
@@ -24,6 +24,7 @@ const VIEWS = [
   ["identification", "Identification"],
   ["results", "Results"],
   ["socket", "Socket"],
+  ["start", "Start"], // of a folder without a study, which has no other view
 ];
 const TOPICS = ["study", "stages", "labels", "log", "acquired"];
 const EVERY_MS = 1000;
@@ -81,6 +82,7 @@ async function tell(changed) {
     seen = null;
   }
   head();
+  if (context.view && !isOpen(context.view)) route(); // the study has just been made
   tellViews(changed);
 }
 
@@ -108,7 +110,12 @@ function offline(text) {
 
 const MARKS = { done: "✓", stale: "↻", begun: "…", missing: "○" };
 
+function isOpen(key) {
+  return (key === "start") === (context.study?.is_new ?? false);
+}
+
 function head() {
+  for (const [key] of VIEWS) document.getElementById(`tab-${key}`).hidden = !isOpen(key);
   const name = context.study?.name ?? "";
   document.title = name ? `${name} – limbfit studio` : "limbfit studio";
   document.getElementById("study-name").textContent = name;
@@ -158,8 +165,9 @@ async function open(name) {
 
 function route() {
   const name = location.hash.replace(/^#\/?/, "").split("/")[0];
-  const known = VIEWS.some(([key]) => key === name);
-  open(known ? name : context.study?.has_image === false ? "traces" : "image");
+  const known = VIEWS.some(([key]) => key === name && isOpen(key));
+  if (context.study?.is_new) open("start");
+  else open(known ? name : context.study?.has_image === false ? "traces" : "image");
 }
 
 function tabs() {
@@ -171,20 +179,20 @@ function tabs() {
     }, title));
   });
   const go = (i) => {
-    const [key] = VIEWS[(i + VIEWS.length) % VIEWS.length];
+    const open = VIEWS.filter(([key]) => isOpen(key)), [key] = open[(i + open.length) % open.length];
     location.hash = `#/${key}`;
     document.getElementById(`tab-${key}`).focus();
   };
   bar.addEventListener("keydown", (event) => {
     const at = VIEWS.findIndex(([key]) => key === context.view);
-    const to = { ArrowRight: at + 1, ArrowLeft: at - 1, Home: 0, End: VIEWS.length - 1 }[event.key];
+    const to = { ArrowRight: at + 1, ArrowLeft: at - 1, Home: 0, End: -1 }[event.key];
     if (to !== undefined) {
       go(to);
       event.preventDefault();
     }
   });
   document.addEventListener("keydown", (event) => {
-    if (event.altKey && !event.ctrlKey && !event.metaKey && event.key >= "1" && event.key <= String(VIEWS.length)) {
+    if (event.altKey && !event.ctrlKey && !event.metaKey && event.key >= "1" && event.key < String(VIEWS.length)) {
       go(Number(event.key) - 1);
       event.preventDefault();
     }
@@ -215,6 +223,7 @@ async function begin() {
   theme();
   tabs();
   await context.load(document.getElementById("view"), "the study", () => poll());
+  for (const kind of ["dragover", "drop"]) addEventListener(kind, (event) => event.preventDefault()); // else a file takes the page's place
   addEventListener("hashchange", route);
   route();
 }

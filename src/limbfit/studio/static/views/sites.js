@@ -11,7 +11,8 @@ export class SiteEditor {
     this.list = el("ul", { class: "plain site-list" });
     this.form = el("div", { class: "site-form" });
     this.part = el("div", {}, el("h2", {}, "Sites"), this.list,
-      el("div", { class: "row" }, (this.adder = el("button", { type: "button", onclick: () => this.begin("add") }, "Add a site"))), this.form);
+      el("div", { class: "row" }, (this.adder = el("button", { type: "button", onclick: () => this.begin("add") }, "Add a site")),
+        el("button", { type: "button", onclick: () => this.send("model/markers", { depth_mm: DEPTH_MM }, "Each marker has a site.") }, "Take the markers")), this.form);
   }
 
   show() {

@@ -2,6 +2,7 @@
 import { el, replace } from "/static/dom.js";
 import { HandledChart } from "/static/handles.js";
 import { LivePanel } from "/static/views/live.js";
+import { upload } from "/static/views/start.js";
 
 const TIME = { title: "Time", unit: "s" };
 const FORCE = { title: "Force", unit: "N" };
@@ -111,9 +112,10 @@ class TracesView {
 
   async read(site) {
     const turn = (this.turn = (this.turn ?? 0) + 1);
+    this.area.ondrop = null;
     if (!site.is_recorded) {
       this.close();
-      return { text: site.has_trace ? `Its record is yet to be made: limbfit acquire STUDY --site ${site.name}` : "This site has no record: it is planned to be simulated. Measure it (limbfit acquire), and name the file as its trace in study.toml." };
+      return { text: site.has_trace ? `Its record is yet to be made: limbfit acquire STUDY --site ${site.name}` : "This site has no record: it is planned to be simulated. Drop its record here, or choose the file.", actions: site.has_trace ? [] : this.attaching(site) };
     }
     const record = await this.context.api.get(`traces/${encodeURIComponent(site.name)}`);
     if (turn !== this.turn) return;
@@ -129,6 +131,28 @@ class TracesView {
       new HandledChart(loop, this.loop(), 240),
     ];
     this.tell();
+  }
+
+  /** A place to drop a record of the site on, and whether the site is fitted. */
+  attaching(site) {
+    const fitted = el("input", { type: "checkbox", checked: true });
+    const take = async (file) => {
+      try {
+        const path = await upload(this.context, file, `traces/${file.name}`);
+        const facts = await this.context.api.post(`traces/${encodeURIComponent(site.name)}/record`, { path, fitted: fitted.checked });
+        this.context.say(`The record of site ${site.name}: ${facts.peak_force_N.toFixed(2)} N at ${facts.depth_mm.toFixed(2)} mm.`);
+      } catch (error) {
+        this.context.warn(error.message);
+      }
+      await this.context.refresh();
+    };
+    const input = el("input", { type: "file", "aria-label": `record of site ${site.name}`, onchange: () => input.files[0] && take(input.files[0]) });
+    this.area.ondragover = (event) => event.preventDefault();
+    this.area.ondrop = (event) => {
+      event.preventDefault();
+      if (event.dataTransfer.files[0]) take(event.dataTransfer.files[0]);
+    };
+    return [input, el("label", { class: "row" }, fitted, "fitted (otherwise held out)")];
   }
 
   series(key) {
