@@ -63,6 +63,7 @@ from .pipeline.engine.context import Progress as Progress
 from .pipeline.commands.acquire import (
     acquire_site as acquire_site,
     check_recording as check_recording,
+    check_rig as check_rig,
     judge_recording as judge_recording,
     serve_fitsocket as serve_fitsocket,
     virtual_fitsocket as virtual_fitsocket,

@@ -9,7 +9,7 @@ Nothing here knows a mesh or a solver, and of the study the table ``[acquire]`` 
 them together.
 """
 
-from .device import DEFAULT_ADDRESS, DEFAULT_PORT, LineDevice, connect
+from .device import DEFAULT_ADDRESS, DEFAULT_PORT, Device, LineDevice, connect
 from .protocol import Event, Settings
 from .recording import (
     RecordedRamp,

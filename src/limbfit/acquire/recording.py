@@ -244,7 +244,7 @@ def _read_whole_blocks(data: bytes, before: _WholeBlocks, most: int = sys.maxsiz
 def _parse_content(content: bytes, lost_bytes: int, every: int = 1) -> Recording:
     """Head, events and each ``every``-th sample of whole blocks."""
     head: dict[str, Any] = {}
-    events, rows = [], []
+    events, rows, columns = [], [], len(list_columns(PINS))
     try:
         for line in content.decode("ascii").split("\n"):
             if line.startswith("#head "):
@@ -253,13 +253,14 @@ def _parse_content(content: bytes, lost_bytes: int, every: int = 1) -> Recording
                 events.append(json.loads(line[7:]))
             elif line[:1].isdigit():
                 rows.append(line)
+            elif line.startswith(_NAMES[0]):
+                columns = line.count(",") + 1
         for event in events:
             event["at_us"], event["event"] = int(event["at_us"]), str(event["event"])
     except (ValueError, KeyError, TypeError, RecursionError, OverflowError):
         raise TraceError("it has a line that no record holds") from None
     if not isinstance(head, dict):
         raise TraceError("its head is not a table")
-    columns = len(list_columns(head.get("device", {}).get("pins", PINS)))
     table = _read_table(rows[every - 1 :: every], columns)
     host_us, device_us, number, flags, moving = table[:, : len(_NAMES)].T
     position, force, capacitance = np.split(table[:, len(_NAMES) :], 3, axis=1)

@@ -122,7 +122,7 @@ class Guard:
         return None
 
     def _check_frozen_sensors(self, sample: Sample) -> Violation | None:
-        """Find a sensor that repeats itself: a live one is noisy, or changes as its pin travels in contact."""
+        """Find a sensor that repeats itself: a live one is noisy, or changes as its pin goes deeper."""
         if self.limits.resolution_mN:
             return self._check_coarse_sensors(sample)
         if self._last_forces:
@@ -135,7 +135,6 @@ class Guard:
                     return Violation("dead", k + 1, text)
         self._last_forces = sample.force_mN
         return None
-
 
     def _check_coarse_sensors(self, sample: Sample) -> Violation | None:
         last, places = self._last_forces or sample.force_mN, self._changed_at_um or list(sample.position_um)

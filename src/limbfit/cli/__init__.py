@@ -23,7 +23,7 @@ GROUPS: Mapping[str, tuple[str, ...]] = {
     "Identify": ("run", "status", "report", "simulate", "batch", "reproduce"),
     "Trust": ("uncertainty", "crossvalidate", "regions", "sensitivity", "cube", "experiment"),
     "Socket": ("socket", "population", "shapes"),
-    "Experiment": ("design", "acquire", "recording", "watch", "virtual-fitsocket"),
+    "Experiment": ("design", "acquire", "recording", "watch", "rig", "virtual-fitsocket"),
     "Exchange": ("export", "febio", "compare", "schema"),
     "Machine": ("studio", "doctor", "bench"),
 }

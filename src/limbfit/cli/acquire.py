@@ -20,7 +20,7 @@ from rich.console import Group
 from rich.live import Live as RichLive
 from rich.panel import Panel
 from rich.text import Text
-from typer import Argument, Exit, Option
+from typer import Argument, Exit, Option, prompt
 
 import limbfit
 
@@ -55,7 +55,9 @@ HINTS = {
 def acquire(
     study: StudyPath,
     site: Annotated[str | None, Option(help="site, or record such as 01-2; default: all not made")] = None,
-    device: Annotated[str, Option(help="tcp://HOST[:PORT] or serial:PATH[@BAUD]")] = DEFAULT_ADDRESS,
+    device: Annotated[
+        str, Option(help="tcp://HOST[:PORT], serial:PATH[@BAUD], or rig:FILE of a rig of your own")
+    ] = DEFAULT_ADDRESS,
     depth: Annotated[float | None, Option(help="mm from touch at which the depth search ends")] = None,
     unattended: Annotated[
         bool,
@@ -203,6 +205,30 @@ def _show_verdict(found: RecordVerdict) -> None:
         print_line(f"     {reason}")
 
 
+def rig(
+    file: Annotated[
+        Path, Argument(help="TOML file of the rig (docs/device-protocol.md)", show_default=False)
+    ],
+    weight_kg: Annotated[
+        float, Option(help="known mass that is hung on the sensor", min=0.01, show_default=False)
+    ],
+) -> None:
+    """Check the force of a rig of your own with a known weight, as a session needs every day."""
+    print_line("leave the force sensor unloaded")
+    found = limbfit.check_rig(file, weight_kg, lambda: _wait_for_weight(weight_kg))
+    print_line(
+        f"the weight shows {found['ratio']:.3f} times its force; next: limbfit acquire --device rig:{file}"
+    )
+
+
+def _wait_for_weight(weight_kg: float) -> None:
+    prompt(
+        f"hang {weight_kg:g} kg on it, wait until it hangs still, and press Enter",
+        default="",
+        show_default=False,
+    )
+
+
 def virtual_fitsocket(
     study: StudyPath,
     seed: Annotated[int, Option(help="seed of the limb's place and the sensors' noise", min=0)] = 0,
@@ -323,4 +349,4 @@ def read_keys(events: SimpleQueue[Event], gap_s: float) -> Iterator[None]:
         termios.tcsetattr(handle, termios.TCSADRAIN, before)
 
 
-VERBS = (acquire, recording, watch, virtual_fitsocket)
+VERBS = (acquire, recording, watch, rig, virtual_fitsocket)

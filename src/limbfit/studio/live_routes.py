@@ -11,7 +11,6 @@ from fastapi import APIRouter, Query
 from pydantic import BaseModel, ValidationError
 
 from ..acquire import Recording, follow_recording
-from ..acquire.line_protocol import PINS
 from ..acquire.protocol import FINAL
 from ..acquire.recording import Check
 from ..errors import TraceError
@@ -83,7 +82,10 @@ def _compute_age(file: Path) -> float:
 def _read(part: Recording, file: Path, first: bool) -> Json:
     try:
         settings = part.head["settings"]
-        pin, limit_N = range(PINS)[int(settings["pin"]) - 1], float(settings["force_limit_N"])
+        pin, limit_N = (
+            range(part.position_um.shape[1])[int(settings["pin"]) - 1],
+            float(settings["force_limit_N"]),
+        )
         ramps = int(settings["precondition"]) + int(settings["repeats"])
         phases = [_describe_phase(event) for event in part.events if event["event"] == "phase"]
         if not math.isfinite(limit_N):

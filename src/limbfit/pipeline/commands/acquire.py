@@ -13,8 +13,9 @@ from pydantic import ValidationError
 
 from ... import acquire
 from ..._version import __version__
+from ...acquire.rig import Rig, find_check, judge_weight, measure_mean_force, open_rig, read_rig, store_check
 from ...acquire.virtual import Endpoint, Fault, Surrogate, VirtualFitSocket, VirtualLimb, fit_surrogate, serve
-from ...errors import InputError, TraceError, add_location
+from ...errors import InputError, RunError, TraceError, add_location
 from ...results.base import read_curves
 from ...results.limb import TracesResult
 from ...study import Indentation, Record, Study
@@ -25,6 +26,7 @@ from ..engine.store import translate_disk_errors, write_curves, write_json
 
 FOLDER = "acquired"  # beside the study file: measured data, no result
 RECORD, VERDICT = "record.csv", "verdict.json"
+TOUCH_STEPS = 3  # of a force sensor: a touch is felt by so many of its steps at least
 
 
 def waiting(study: Study) -> list[Indentation]:
@@ -52,7 +54,8 @@ def acquire_site(
 
     Parameters
     ----------
-    address : of the device: ``tcp://HOST[:PORT]`` or ``serial:PATH[@BAUD]``.
+    address : of the device: ``tcp://HOST[:PORT]``, ``serial:PATH[@BAUD]``, or ``rig:FILE`` for a stage and a
+        force sensor of one's own.
     operator : where events of the operator come from (`limbfit.acquire.Keyboard`).  None: unattended - the
         limb counts as in place, and the key as held until the search is ``depth_mm`` deep.
     stops : unattended, where events that end the session come from (`limbfit.acquire.protocol.Abort`).
@@ -65,7 +68,7 @@ def acquire_site(
     settings = check_recording(
         study, name, depth_mm=depth_mm, unattended=operator is None, replace_record=replace_record
     )
-    device = acquire.LineDevice(acquire.connect(address))
+    device = open_device(address, settings)
     try:
         folder, recorder = _begin_record(study, one, device, settings, unattended=operator is None)
     except BaseException:
@@ -100,8 +103,48 @@ def acquire_site(
     return found | _store_ramps(study, one, folder, ending.is_completed)
 
 
+def open_device(address: str, settings: acquire.Settings) -> acquire.Device:
+    """The device of an address; see `acquire_site` for the errors."""
+    if not address.startswith("rig:"):
+        return acquire.LineDevice(acquire.connect(address))
+    file = Path(address.removeprefix("rig:"))
+    table = read_rig(file)
+    if settings.pin != 1:
+        raise InputError("a rig has one pin", file=file, remedy="leave acquire.pin out")
+    least_N = TOUCH_STEPS * table.force.resolution_N
+    if settings.touch_N < least_N:
+        what = f"its force is resolved to {table.force.resolution_N:g} N: too coarse for acquire.touch_N"
+        raise InputError(what, file=file, place="force.resolution_N", remedy=f"state touch_N = {least_N:g}")
+    if settings.force_limit_N >= table.force.range_N:
+        remedy = f"state acquire.force_limit_N below {table.force.range_N:g} N"
+        raise InputError(
+            "its force sensor ends before the limit", file=file, place="force.range_N", remedy=remedy
+        )
+    return Rig(table, find_check(file))
+
+
+def check_rig(file: str | Path, weight_kg: float, hang: Callable[[], None]) -> dict[str, float]:
+    """Compare a rig's force with that of a known weight; a session with the rig needs this on the same day.
+
+    Returns ``idle_N``, ``loaded_N`` and ``ratio`` to what the weight should show. Raises `InputError` for a
+    file that is none, and `RunError` where an instrument does not answer, or the force is off by over 5 %.
+
+    ``hang``: is called when the weight is to be hung on the sensor, and returns when it is.
+    """
+    path = Path(file)
+    with open_rig(path) as rig:
+        idle_N = measure_mean_force(rig)
+        hang()
+        loaded_N = measure_mean_force(rig)
+    ratio, wrong = judge_weight(idle_N, loaded_N, weight_kg)
+    if wrong:
+        raise RunError(f"{path}: {wrong}; mend force.N_per_unit or the sensor, and check it again")
+    store_check(path, ratio)
+    return {"idle_N": idle_N, "loaded_N": loaded_N, "ratio": ratio}
+
+
 def _begin_record(
-    study: Study, one: Indentation, device: acquire.LineDevice, settings: acquire.Settings, unattended: bool
+    study: Study, one: Indentation, device: acquire.Device, settings: acquire.Settings, unattended: bool
 ) -> tuple[Path, acquire.Recorder]:
     """A new folder of the indentation, and in it the record with how it is made as its head."""
     with translate_disk_errors(study.folder):
