@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from typing import ClassVar, Self
 
 import numpy as np
@@ -61,10 +60,6 @@ class Area:
         """(3,) the middle, LPS mm."""
         return self.points.mean(axis=0)
 
-    @cached_property
-    def _tree(self) -> KDTree:
-        return KDTree(self.points)
-
     def depth(self, points: Array) -> Array:
         """(n,) mm at points (n, 3)."""
         return self.depth_mm * self.share(points)
@@ -75,7 +70,7 @@ class Area:
 
     def relative_distance(self, points: Array) -> Array:
         """Distances (...) of points (..., 3) from it over its radius."""
-        return np.asarray(self._tree.query(points)[0] / self.radius_mm)
+        return np.asarray(KDTree(self.points).query(points)[0] / self.radius_mm)
 
     def project_to(self, face: Surface) -> Self:
         """Put its points on the drawn face (LPS), which a liner keeps off the skin; leave out those off it.

@@ -74,11 +74,6 @@ class TrimmedLimb:
         share = ((way - low) / (high - low))[:, None]
         return np.asarray((1 - share) * self.meridians[rows, after - 1] + share * self.meridians[rows, after])
 
-    def tangent(self, way: Array) -> Array:
-        """(angles, 3) unit vectors along the meridians, towards the brim, over some mm."""
-        step = self.find_points(way + 3.0) - self.find_points(way - 3.0)
-        return np.asarray(step / np.linalg.norm(step, axis=1, keepdims=True))
-
 
 def trim_limb(limb: LimbProfile, frame: Frame, trim: Trim) -> TrimmedLimb:
     """Cut the meridians of a limb at its trimline. Raises `SurfaceError` where the brim would lie beyond the
@@ -195,7 +190,9 @@ class Recipe:
 
 @dataclass(frozen=True, eq=False)
 class SocketSurface:
-    """Triangles on the limb, and how far each point lies below the brim along the limb, mm."""
+    """Triangles on the limb; of each point how far it lies below the brim along the limb, mm, and the unit
+    vector towards it.
+    """
 
     points: Array
     faces: Indices
@@ -283,7 +280,9 @@ def _draw_surface(lines: TrimmedLimb, recipe: Recipe) -> SocketSurface:
         where = (np.arange(count) + 0.5 * (number % 2)) / count  # of every other ring half a step on
         at.append(where)
         rings.append(CubicSpline(share, closed, bc_type="periodic")(where))
-        fields = np.column_stack([lengths - way, lines.tangent(way)])
+        upwards = lines.find_points(way + 3.0) - lines.find_points(way - 3.0)
+        upwards /= np.linalg.norm(upwards, axis=1, keepdims=True)
+        fields = np.column_stack([lengths - way, upwards])
         values = [np.interp(where, share[:-1], field, period=1.0) for field in fields.T]
         below.append(values[0])
         up.append(np.column_stack(values[1:]))
