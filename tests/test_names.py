@@ -20,7 +20,7 @@ finish fit flatten follow format from generate get grade group grow guess has ho
 improve insert integrate interpolate interpret interrupt intersect invert is iterate join judge keep
 label level limit link list listen load locate lock log lump main make mark match measure mend merge
 mesh minimise mix move multiply mute name normalise number observe open optimise orient outline pack
-paint pair parse place plan plot pool post predict prefetch prepare prepend press preview print
+paint pair parse place plan plot pool post predict prefetch prepare press preview print
 prioritise project prolong prompt pull rank rasterise read record recover rectify redact reduce refactor
 refine refit refuse register regularise release remesh remove render renew repair replace report
 reproduce resample rescale resolve respond restate restrict resume rotate round run sample save scale

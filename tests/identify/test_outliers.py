@@ -69,7 +69,9 @@ def study(seed: int, corruption: tuple = ("none",), fitted: int = 4):
         return [bar.respond(parameters) for bar in bars]
 
     one = np.array(found.stages[0].parameters)
-    return find_outliers(simulate, data, found.parameters, list(map(history, bars)), simulate_exchange, one)
+    return find_outliers(simulate, data, found.parameters, list(map(history, bars)), simulate_exchange, one)[
+        1
+    ]
 
 
 def test_the_expansion_is_exact_where_only_moduli_change():
@@ -99,14 +101,14 @@ def test_a_curve_driven_by_another_record_is_close_to_its_simulation():
 
 @pytest.mark.parametrize("seed", range(2))
 def test_clean_studies_have_no_warning(seed):
-    assert study(seed).warnings == ()
+    assert study(seed) == ()
 
 
 @pytest.mark.parametrize(
     ("seed", "site", "factor"), [(0, 1, 9.81), (1, 5, 9.81), (2, 1, 4.448), (0, 5, 4.448)]
 )
 def test_a_force_in_another_unit_is_named(seed, site, factor):
-    warnings = study(seed, ("force", site, factor)).warnings
+    warnings = study(seed, ("force", site, factor))
     assert [(warning.sites, warning.kind) for warning in warnings] == [((f"s{site}",), "unit")]
     assert f"{factor:.3g}" in warnings[0].cause
     assert warnings[0].evidence["error_after_percent"] < 12
@@ -120,7 +122,7 @@ def test_swapped_names_are_found_whoever_was_fitted(pair):
         # Sites that answer alike may be exchanged without harm, and nobody can tell.
         if abs(bars[pair[0]].depth - bars[pair[1]].depth) < 1.5:
             continue
-        warnings = study(seed, ("swap", *pair)).warnings
+        warnings = study(seed, ("swap", *pair))
         assert [(warning.sites, warning.kind) for warning in warnings] == [
             (tuple(f"s{i}" for i in pair), "swap")
         ]
@@ -131,7 +133,7 @@ def test_swapped_names_are_found_whoever_was_fitted(pair):
 @pytest.mark.parametrize("seed", range(2))
 def test_a_site_of_other_tissue_is_warned_of_with_the_evidence(seed):
     """Among six sites its record may also be explained by an exchange: there is a warning either way."""
-    warnings = study(seed, ("stiff", 4)).warnings
+    warnings = study(seed, ("stiff", 4))
     assert "s4" in {site for warning in warnings for site in warning.sites}
     for warning in warnings:
         if warning.kind == "outlier":
@@ -167,7 +169,7 @@ def test_too_few_sites_cannot_tell_who_is_wrong():
     bars = limb(0)[:3]
     data = [MeasuredCurve(f"s{k}", bar.force(TRUTH) * (9.81 if k else 1)) for k, bar in enumerate(bars)]
     simulate = LogLinearModel(TRUTH, [bar.respond(TRUTH) for bar in bars])
-    assert find_outliers(simulate, data, TRUTH, [], None, TRUTH).warnings == ()
+    assert find_outliers(simulate, data, TRUTH, [], None, TRUTH)[1] == ()
 
 
 def test_ratios_name_units():

@@ -91,7 +91,7 @@ def test_a_person_is_an_ordinary_study(tmp_path):
     limb = people.build_limb(person, tmp_path / "one")
     study = people.write_study(person, people.trial.rules[0], limb, tmp_path / "one" / "tight")
     assert (study.socket.reduction_percent, study.socket.edge_mm) == (5.0, 20.0)
-    assert study.socket.body_weight_N == pytest.approx(person.weight_N, abs=0.01)
+    assert study.socket.body_weight_N == pytest.approx(person.inputs["body weight (N)"], abs=0.01)
     values = people.choose_parameters(person, study)
     assert values["muscle"]["c_kPa"] == person.inputs["muscle.c_kPa"]
     assert values["muscle"]["tau_s"] == study.material.get("muscle", "start")["tau_s"]

@@ -109,12 +109,18 @@ def build_socket_problem(
         growth, z = [1.0, 1.0], [-fit.travel_mm, 0.0]
     if fit.hold_s > 0.0:
         times, growth, z = [*times, fit.donning_s + fit.hold_s], [*growth, 1.0], [*z, 0.0]
-    motion, before = Motion.of(times, growth=growth, z=z), None
+    motion, before = Motion.of(times, growth=growth, z=z), np.full(6, np.nan)  # what holds the donned socket
     for load in fit.loads:
+        if not load.ramp_s > 0.0:
+            what = f"the load {load.name!r} comes on within {load.ramp_s:g} s"
+            raise ProblemError(what, remedy="give it time")
         force = np.asarray(load.force, dtype=float)
         moment = np.asarray(load.moment) + np.cross(np.asarray(load.point) - fit.pivot, force)
         after = np.concatenate([frame @ force, frame @ moment])  # about the pivot, in socket coordinates
-        motion, before = motion.then(_build_loading(load, before, after)), after
+        count = 3 if load.hold_s > 0.0 else 2
+        values = dict(zip(COORDINATES, np.array([before, after, after][:count]).T, strict=True))
+        times = [0.0, load.ramp_s, load.ramp_s + load.hold_s][:count]
+        motion, before = motion.then(Motion.of(times, force=values)), after
     body = RigidBody(shape, mesh.face_sets[OUTER], motion, fit.friction, name="socket")
     return build_limb_problem(mesh, materials, motion.times[-1], bodies=(body,))
 
@@ -131,17 +137,6 @@ def build_limb_problem(mesh: Mesh, materials: Mapping[str, Material], end_s: flo
         element=ELEMENT,
         **loads,
     )
-
-
-def _build_loading(load: Load, before: Array | None, after: Array) -> Motion:
-    """From the last load, or from what holds the donned socket, to this one."""
-    if not load.ramp_s > 0.0:
-        raise ProblemError(f"the load {load.name!r} comes on within {load.ramp_s:g} s", remedy="give it time")
-    rows = [np.full(6, np.nan) if before is None else before, after, after]
-    times = [0.0, load.ramp_s, load.ramp_s + load.hold_s]
-    count = 3 if load.hold_s > 0.0 else 2
-    values = np.array(rows[:count])
-    return Motion.of(times[:count], force=dict(zip(COORDINATES, values.T, strict=True)))
 
 
 def build_socket_steps(fit: SocketFit, modulus: float, threads: int | None = None) -> StepControl:

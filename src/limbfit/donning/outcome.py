@@ -63,14 +63,27 @@ def simulate_donning(
 
     def record(step: Step) -> None:
         found = compute_tractions(system, laws, step.state)
-        rows.append(_build_row(step, found, patches))
+        values = {name: Patch.from_tractions(found, mask) for name, mask in patches.items()}
+        row = SocketStep(
+            time=step.time,
+            force=step.reactions[0, :3],
+            moment=step.reactions[0, 3:],
+            move=step.coordinates[0, :3],
+            turn=np.degrees(step.coordinates[0, 3:]),
+            contact_area_mm2=found.contact_area,
+            penetration_mm=step.penetration,
+            imbalance=0.0,  # until the end
+            whole=values.pop(WHOLE),
+            regions=values,
+        )
+        rows.append(row)
         for name in fit.find_held(step.time):
             pressure, shear = found.average_at_nodes(len(problem.mesh.points))
             slopes = _compute_slopes(problem, system, laws, step.state, patches) if sensitivities else {}
             strains = Strains.from_state(system, laws, step.state)
-            held[name] = LoadedState(rows[-1], pressure, shear, step.state.u, strains, slopes)
+            held[name] = LoadedState(row, pressure, shear, step.state.u, strains, slopes)
         if on_row is not None:
-            on_row(rows[-1])
+            on_row(row)
 
     control = steps or build_socket_steps(fit, laws.modulus, threads)
     checkpoints = None
@@ -84,22 +97,6 @@ def simulate_donning(
     shares = result.imbalance[1:, 0]
     balanced = tuple(replace(row, imbalance=float(share)) for row, share in zip(rows, shares, strict=True))
     return DonningResult(result, balanced, held)
-
-
-def _build_row(step: Step, found: Tractions, patches: Mapping[str, Mask]) -> SocketStep:
-    values = {name: Patch.from_tractions(found, mask) for name, mask in patches.items()}
-    return SocketStep(
-        time=step.time,
-        force=step.reactions[0, :3],
-        moment=step.reactions[0, 3:],
-        move=step.coordinates[0, :3],
-        turn=np.degrees(step.coordinates[0, 3:]),
-        contact_area_mm2=found.contact_area,
-        penetration_mm=step.penetration,
-        imbalance=0.0,
-        whole=values.pop(WHOLE),
-        regions=values,
-    )
 
 
 def _compute_slopes(

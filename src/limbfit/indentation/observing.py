@@ -18,7 +18,7 @@ of speeds are differences of the closed form above along both, within 1e-6.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 
@@ -163,42 +163,31 @@ def observe_result(result: Result, model: SiteModel, times_s: Array) -> tuple[Ar
     gauges = (*_build_layer_gauges(model, mesh), *_build_skin_gauges(model, mesh))
     if not states:
         return np.zeros((model.gauges, len(times_s))), None
-    values, slopes = _read_at_states(result, model.waves, [gauge.read for gauge in gauges])
-    since_touch = np.arange(len(values)) < len(gauges)
+
+    def read_gauges(fields: list[Array]) -> Array:
+        """What the gauges read of nodal fields in all states, (g, s + 1, ...); nothing at rest before."""
+        found = np.array([[gauge.read(field) for field in fields] for gauge in gauges])
+        return np.concatenate([np.zeros_like(found[:, :1]), found], axis=1)
+
     at = np.clip(np.append(model.waits_s, times_s), result.times[0], result.times[-1])
 
-    def interpolate_states(of_states: Array) -> Array:
+    def interpolate_states(of_states: Array, is_length: bool) -> Array:
         """What is (g, s, ...) in the states at the wanted times, (g, n, ...); lengths since touch-down."""
         kinks, steps = result.problem.kinks, result.times[: of_states.shape[1]]
         column = np.moveaxis(of_states, 1, 0)
         found = np.moveaxis(interpolate(steps, np.ones(len(steps)), kinks, column, at), 0, 1)
-        found[since_touch] -= found[since_touch, :1]
-        return np.asarray(found[:, 1:])
+        return np.asarray(found[:, 1:] - found[:, :1] if is_length else found[:, 1:])
 
-    return interpolate_states(values), None if slopes is None else interpolate_states(slopes)
-
-
-def _read_at_states(
-    result: Result, waves: Sequence[WavePlace], reads: Sequence[Callable[[Array], Array]]
-) -> tuple[Array, Array | None]:
-    """What gauges ``read`` and how fast waves are, at rest and in every state, and derivatives."""
-    states, values, slopes = result.states, [], []
-    if reads:
-        values.append(_prepend_rest([[read(state.u) for state in states] for read in reads]))
+    values, slopes = list[Array](), list[Array]()
+    if gauges:
+        values.append(interpolate_states(read_gauges([state.u for state in states]), True))
         if states[0].sensitivity is not None:
             fields = [np.asarray(state.sensitivity) for state in states]
-            slopes.append(_prepend_rest([[read(field) for field in fields] for read in reads]))
-    if waves:
-        speeds, of_speeds = compute_wave_speeds(result, waves)
-        values.append(speeds)
-        slopes += [] if of_speeds is None else [of_speeds]
+            slopes.append(interpolate_states(read_gauges(fields), True))
+    if model.waves:
+        for rows, speeds in zip((values, slopes), compute_wave_speeds(result, model.waves), strict=True):
+            rows += [] if speeds is None else [interpolate_states(speeds, False)]
     return np.concatenate(values), np.concatenate(slopes) if slopes else None
-
-
-def _prepend_rest(rows: Sequence[Sequence[Array]]) -> Array:
-    """What is (g, s, ...) in the states, with nothing at rest before: (g, s + 1, ...)."""
-    found = np.array(rows)
-    return np.concatenate([np.zeros_like(found[:, :1]), found], axis=1)
 
 
 @dataclass(frozen=True)
@@ -250,21 +239,13 @@ def find_nearest_points(nodes: Array, faces: Indices, points: Array) -> SkinPoin
     return SkinPoints(feet, np.linalg.norm(feet - points, axis=1), faces[near], shape(local)[0])
 
 
-@dataclass(frozen=True)
 class _Regions:
-    """The points of several places: of number ``place`` (m,) each; ``A`` and ``N`` see `WavePlace`."""
+    """The points of several places, each of number ``place`` (m,), with its motion and way (m, 3)."""
 
-    points: EvaluationPoints
-    nodes: Indices
-    place: Indices
-    motion: Array
-    way: Array
-
-    @classmethod
-    def from_result(cls, result: Result, places: Sequence[WavePlace]) -> _Regions:
+    def __init__(self, result: Result, places: Sequence[WavePlace]) -> None:
         mesh, system = result.problem.mesh, result.system
         cells, local = zip(*(_locate_points(mesh, place) for place in places), strict=True)
-        number = np.repeat(np.arange(len(places)), [len(own) for own in cells])
+        self.place = np.repeat(np.arange(len(places)), [len(own) for own in cells])
         points = EvaluationPoints.from_cells(
             mesh,
             result.problem.formulation,
@@ -273,10 +254,10 @@ class _Regions:
             system.fibres,
             system.prestretch,
         )
-        nodes, renumbered = np.unique(points.cells, return_inverse=True)
-        points = replace(points, cells=renumbered.reshape(points.cells.shape).astype(np.int32))
-        motion, way = (np.array([getattr(one, name) for one in places])[number] for name in ("motion", "way"))
-        return cls(points, nodes.astype(np.int64), number, motion, way)
+        self.nodes, renumbered = np.unique(points.cells, return_inverse=True)
+        self.points = replace(points, cells=renumbered.reshape(points.cells.shape).astype(np.int32))
+        self.motion = np.array([place.motion for place in places])[self.place]
+        self.way = np.array([place.way for place in places])[self.place]
 
     def speeds(self, laws: Laws, steps: Sequence[Array], seconds: Array, turned: Mask) -> Array:
         """Speeds (k, s) m/s after the ``steps``: displacements (n, 3) of the nodes, mm, since rest.
@@ -316,15 +297,12 @@ def sample_disc() -> Array:
         inner, outer = 3 * ring * (ring - 1) + 1, 3 * ring * (ring + 1) + 1
         rings.append(np.full(6 * ring, np.sqrt((inner + outer) / (2 * most))))
         angles.append(2 * np.pi * np.arange(6 * ring) / (6 * ring))
-    radius, angle = DISC_RADIUS_MM * np.concatenate(rings), np.concatenate(angles)
-    found = []
-    for layer in range(_LAYERS):
-        turned = angle + np.pi * layer / (6 * _LAYERS)
-        height = DISC_HALF_MM * ((2 * layer + 1) / _LAYERS - 1)
-        found.append(
-            np.column_stack([radius * np.cos(turned), radius * np.sin(turned), np.full(len(radius), height)])
-        )
-    return np.concatenate([np.zeros((1, 3)), *found])
+    layer = np.repeat(np.arange(_LAYERS), most)
+    radius = DISC_RADIUS_MM * np.tile(np.concatenate(rings), _LAYERS)
+    turned = np.tile(np.concatenate(angles), _LAYERS) + np.pi * layer / (6 * _LAYERS)
+    height = DISC_HALF_MM * ((2 * layer + 1) / _LAYERS - 1)
+    points = np.column_stack([radius * np.cos(turned), radius * np.sin(turned), height])
+    return np.concatenate([np.zeros((1, 3)), points])
 
 
 def _locate_points(mesh: Mesh, place: WavePlace) -> tuple[Indices, Array]:
@@ -351,7 +329,7 @@ def compute_wave_speeds(result: Result, places: Sequence[WavePlace]) -> tuple[Ar
     The result must hold all of its states (``store="all"``).
     """
     problem, states = result.problem, result.states
-    regions = _Regions.from_result(result, places)
+    regions = _Regions(result, places)
     times = np.array([0.0, *(state.time for state in states)])
     seconds, turned = np.diff(times, prepend=0.0), _find_turns(result, times)
 

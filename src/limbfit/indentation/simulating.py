@@ -46,11 +46,6 @@ class SimulationJob:
     nested_mm: float | None = None
 
     @property
-    def guess_job(self) -> SimulationJob:
-        """The job on the same mesh whose simulation gives the first guesses; there are ``starts``."""
-        return replace(self, parameters=self.starts[-1], starts=self.starts[:-1], sensitivities=True)
-
-    @property
     def nested_job(self) -> SimulationJob | None:
         """The job on a part of the mesh whose simulation gives the first guesses, where there is one."""
         if self.nested_mm is None:
@@ -135,7 +130,7 @@ def _prepare(model: SiteModel, tissues: tuple[str, ...]) -> PreparedSite:
             if model.within_mm is not None:
                 within = min(within, model.within_mm)
             # Under a stated force too it is driven by its displacement; nothing else moves the limb.
-            near = replace(model.bare, knots_N=(), within_mm=within)
+            near = replace(model, clamps=None, course=(), prestretch=(), knots_N=(), within_mm=within)
             allowed = _PENETRATION_MARGIN * control.penetration
             yielding = _estimate_yielding(near, tissues, key[-1])
             penalty = max(yielding / allowed, 2000.0 / model.indenter.width_mm)
@@ -211,9 +206,10 @@ def _solve_job(job: SimulationJob) -> Result:
 def _prepare_guesses(job: SimulationJob, known: PreparedSite) -> Result:
     """The simulation that gives a job's first guesses, on its own mesh or carried on into it."""
     if job.nested_job is None:
-        found = _solve_job(job.guess_job)
-        if job.guess_job.starts:
-            known.kept["of guesses"] = replace(job.guess_job, times_s=()), found
+        guess = replace(job, parameters=job.starts[-1], starts=job.starts[:-1], sensitivities=True)
+        found = _solve_job(guess)
+        if guess.starts:
+            known.kept["of guesses"] = replace(guess, times_s=()), found
         return found
     near = _solve_job(job.nested_job)
     radius, centre = job.nested_mm, np.array(job.model.position)

@@ -159,11 +159,6 @@ class SiteModel:
         return Activation([0.0, self._rise_and_rest_s[0], *late], [0.0, shares[0], *shares])
 
     @property
-    def bare(self) -> SiteModel:
-        """The model of the site without clamps, activation and pre-stretch."""
-        return replace(self, clamps=None, course=(), prestretch=())
-
-    @property
     def history(self) -> History:
         """The advance of the indenter from touch-down, or the force that presses it."""
         if self.forced:

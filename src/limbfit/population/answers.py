@@ -12,6 +12,7 @@ import numpy as np
 from scipy.stats import binomtest
 
 from ..arrays import Array
+from ..errors import InputError
 from ..extensions import import_extra
 from ..results.population import (
     WORST_PLACE,
@@ -35,13 +36,17 @@ _SOBOL = 512  # base samples of the indices
 
 
 def summarise_trial(trial: Trial, robust: RobustRule | None = None) -> PopulationResult:
-    """All answers of the people who are stored; empty ones where there are none."""
-    rows, numbers, table = _build_table(trial)
+    """All answers of the people who are stored. Raises `InputError` where there are none."""
+    rows = TrialStore(trial).read()
+    numbers = list_done(rows, trial.rules)
+    if not numbers:
+        raise InputError("nobody was simulated yet", file=trial.file, remedy="limbfit population run first")
+    table = build_table(rows, numbers)
     lost = rows[rows["state"] != DONE].drop_duplicates(["person", "rule"])
     names = [rule.name for rule in trial.rules]
-    worst = {name: find_worst(table[name]) for name in names} if numbers else {}
+    worst = {name: find_worst(table[name]) for name in names}
     seconds = rows[rows["person"].isin(numbers) & (rows["quantity"] == "seconds")]["value"]
-    surrogates, drivers, notes = _find_drivers(trial, rows, worst)
+    surrogates, drivers, notes = _find_drivers(trial, rows, numbers, worst)
     ranked = {name: [table.index[i] for i in np.argsort(one)] for name, one in worst.items()}
     return PopulationResult(
         name=trial.population.name,
@@ -49,13 +54,11 @@ def summarise_trial(trial: Trial, robust: RobustRule | None = None) -> Populatio
         people=len(numbers),
         rejected=_list_reasons(lost[(lost["state"] == REJECTED) & (lost["rule"] == names[0])]),
         failed=_list_reasons(lost[lost["state"] == FAILED]),
-        seconds_per_person=float(seconds.mean() * len(names)) if len(seconds) else 0.0,
-        seconds_per_socket=float(seconds.mean()) if len(seconds) else 0.0,
-        quantities=[_describe(key, column.to_numpy()) for key, column in table.items()] if numbers else [],
-        shares=[
-            measure_share(table[name], name, limit) for name in names for limit in trial.limits if numbers
-        ],
-        differences=_compare_rules(table, names, worst) if numbers else [],
+        seconds_per_person=float(seconds.mean() * len(names)),
+        seconds_per_socket=float(seconds.mean()),
+        quantities=[_describe(key, column.to_numpy()) for key, column in table.items()],
+        shares=[measure_share(table[name], name, limit) for name in names for limit in trial.limits],
+        differences=_compare_rules(table, names, worst),
         drivers=drivers,
         surrogates=surrogates,
         worst={name: int(order[-1]) for name, order in ranked.items()},
@@ -65,16 +68,10 @@ def summarise_trial(trial: Trial, robust: RobustRule | None = None) -> Populatio
     )
 
 
-def _build_table(trial: Trial) -> tuple[Any, list[int], Any]:
-    """All rows, the people who wear every rule's socket, and their values by rule, load, place, quantity."""
-    rows = TrialStore(trial).read()
-    numbers = list_done(rows, trial.rules)
+def build_table(rows: Any, numbers: Sequence[int]) -> Any:
+    """The values of the people of these numbers, by rule, load, place and quantity, from stored rows."""
     values = rows[rows["person"].isin(numbers) & (rows["load"] != "")]
-    return (
-        rows,
-        numbers,
-        values.pivot_table(index="person", columns=["rule", "load", "place", "quantity"], values="value"),
-    )
+    return values.pivot_table(index="person", columns=["rule", "load", "place", "quantity"], values="value")
 
 
 def _list_reasons(lost: Any) -> list[str]:
@@ -179,17 +176,16 @@ def predict_left_out(inputs: Array, outputs: Array) -> Array:
 
 
 def _find_drivers(
-    trial: Trial, rows: Any, worst: dict[str, Array]
+    trial: Trial, rows: Any, numbers: Sequence[int], worst: dict[str, Array]
 ) -> tuple[list[SurrogateFit], list[Driver], list[str]]:
     """Surrogates of the worst pressure by rule, and Sobol indices of the inputs on each."""
-    count = len(next(iter(worst.values()), ()))
+    count = len(numbers)
     if count < LEAST_PEOPLE:
         return [], [], [f"what drives the pressures is said from {LEAST_PEOPLE} people on; there are {count}"]
     analyse = import_extra("SALib.analyze.sobol", "population")
     sample = import_extra("SALib.sample.sobol", "population")
     people, notes = People(trial), list[str]()
     names = list(people.names)
-    numbers = list_done(rows, trial.rules)
     given = rows[
         (rows["place"] == INPUT) & rows["person"].isin(numbers) & (rows["rule"] == trial.rules[0].name)
     ]
@@ -227,6 +223,7 @@ def _find_drivers(
 
 def measure_precision(trial: Trial) -> float:
     """Half the width, in percent, of the widest interval of a share over a limit of a trial that has one."""
-    _, _, table = _build_table(trial)
+    rows = TrialStore(trial).read()
+    table = build_table(rows, list_done(rows, trial.rules))
     shares = [measure_share(table[rule.name], rule.name, one) for rule in trial.rules for one in trial.limits]
     return max(0.5 * (one.interval_percent[1] - one.interval_percent[0]) for one in shares)

@@ -47,13 +47,16 @@ def read_bodies(paths: Sequence[Path], unit: str = "mm") -> list[LimbBodies]:
         For limbs whose bodies or triangles differ, and as `read_surface` and `name_bodies`.
     """
     first, *others = [_read_limb(path, unit) for path in paths]
-    merged, index = _merge_corners(first.points)
+    rounded = np.round(first.points, 6)  # points that coincide are one
+    _, where, index = np.unique(rounded, axis=0, return_index=True, return_inverse=True)
+    merged, index = first.points[where], index.ravel()
     faces = {name: index[own] for name, own in first.faces.items()}
     if ALL in faces:
         faces = name_bodies(Surface(merged, faces[ALL]), paths[0])
     limbs = [LimbBodies(merged, faces)]
     for path, limb in zip(paths[1:], others, strict=True):
-        if not _is_same(limb.faces, first.faces):
+        alike = [np.array_equal(limb.faces.get(name, ()), own) for name, own in first.faces.items()]
+        if len(limb.faces) != len(alike) or not all(alike):
             raise InputError(
                 f"its triangles are not those of {paths[0]}",
                 file=path,
@@ -91,29 +94,11 @@ def _stack_bodies(bodies: Mapping[str, Surface]) -> LimbBodies:
     return LimbBodies(stacked.points, dict(zip(bodies, np.split(stacked.faces, ends[:-1]), strict=True)))
 
 
-def _merge_corners(points: Array) -> tuple[Array, Indices]:
-    """Points without those that coincide, and the number (n,) of each one among them."""
-    _, where, index = np.unique(np.round(points, 6), axis=0, return_index=True, return_inverse=True)
-    return points[where], index.ravel()
-
-
-def _is_same(faces: Mapping[str, Indices], others: Mapping[str, Indices]) -> bool:
-    return faces.keys() == others.keys() and all(np.array_equal(faces[k], others[k]) for k in faces)
-
-
-@dataclass(frozen=True)
-class Registration:
-    """How well a limb was met: distances of its surfaces from the bent template, mm."""
-
-    limb: Path
-    rms_mm: float
-    p95_mm: float
-
-
-def register_limbs(paths: Sequence[Path], unit: str = "mm") -> tuple[list[LimbBodies], list[Registration]]:
+def register_limbs(paths: Sequence[Path], unit: str = "mm") -> tuple[list[LimbBodies], list[Array]]:
     """Bring limbs into correspondence: the first one, remeshed, is bent onto each of the others.
 
-    The bending is that of Amberg, Romdhani and Vetter (CVPR 2007), by trimesh, body by body.
+    The bending is that of Amberg, Romdhani and Vetter (CVPR 2007), by trimesh, body by body. How well each
+    limb was met are the distances (n,) of its points from the bent template, mm.
 
     Raises
     ------
@@ -125,7 +110,7 @@ def register_limbs(paths: Sequence[Path], unit: str = "mm") -> tuple[list[LimbBo
     limbs = [read_bodies([path], unit)[0] for path in paths]
     even = {name: remesh(limbs[0].extract(name), TEMPLATE_EDGE_MM) for name in limbs[0].faces}
     template = _stack_bodies(even)
-    found, told = [], []
+    found, distances = [], []
     for path, limb in zip(paths, limbs, strict=True):
         odd = sorted(limb.faces.keys() ^ template.faces.keys())
         if odd:
@@ -135,21 +120,16 @@ def register_limbs(paths: Sequence[Path], unit: str = "mm") -> tuple[list[LimbBo
         points, far = template.points.copy(), []
         for name, faces in template.faces.items():
             source, target = template.extract(name), limb.extract(name)
+            # It begins stretched along the axes, so that it fills the box of the target.
+            share = (source.points - source.points.min(axis=0)) / np.ptp(source.points, axis=0)
+            filling = target.points.min(axis=0) + share * np.ptp(target.points, axis=0)
             bent = registration.nricp_amberg(
-                mesh(_fill_box(source.points, target.points), source.faces, process=False),
+                mesh(filling, source.faces, process=False),
                 mesh(target.points, target.faces, process=False),
                 steps=_STEPS,
             )
             points[np.unique(faces)] = bent
             far.append(np.sqrt(Surface(bent, source.faces).find_nearest(target.points)[0]))
-        distances = np.concatenate(far)
         found.append(LimbBodies(points, template.faces))
-        rms = float(np.sqrt((distances**2).mean()))
-        told.append(Registration(path, rms, float(np.percentile(distances, 95))))
-    return found, told
-
-
-def _fill_box(points: Array, target: Array) -> Array:
-    """Points (n, 3) stretched along the axes so that they fill the box of the target's: where to begin."""
-    low, size = target.min(axis=0), np.ptp(target, axis=0)
-    return low + (points - points.min(axis=0)) / np.ptp(points, axis=0) * size
+        distances.append(np.concatenate(far))
+    return found, distances

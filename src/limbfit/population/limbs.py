@@ -6,7 +6,6 @@ Each source maps numbers of [0, 1), one for each of its ``names``, to a limb.
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
-from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -34,9 +33,13 @@ class DrawnLimb:
 
 
 class LimbSource(ABC):
-    """Limbs by numbers; ``names`` are what the numbers, made into inputs, are called."""
+    """Limbs by numbers; ``names`` are what the numbers, made into inputs, are called.
+
+    ``mean_skin`` is the skin of the mean limb, whose points correspond to ``skin_points``, where any do.
+    """
 
     names: tuple[str, ...]
+    mean_skin: Surface | None = None
 
     @abstractmethod
     def to_inputs(self, numbers: Array) -> Array:
@@ -46,11 +49,6 @@ class LimbSource(ABC):
     def build(self, inputs: Array) -> DrawnLimb:
         """The limb of inputs (d,)."""
 
-    @cached_property
-    def mean_skin(self) -> Surface | None:
-        """The skin of the mean limb, whose points correspond to ``skin_points``; None where none do."""
-        return None
-
 
 class PhantomLimbs(LimbSource):
     """The phantom's limbs: every size of its shape is uniform around its default."""
@@ -59,6 +57,11 @@ class PhantomLimbs(LimbSource):
         self.shape: LimbShape = LIMBS[kind]
         self.sizes = fields(self.shape)
         self.names = tuple(size.name for size in self.sizes)
+        rows, around = np.arange(_ALONG - 1)[:, None] * _AROUND, np.arange(_AROUND)
+        a, b = rows + around, rows + np.roll(around, -1)
+        corners = [[a, b, b + _AROUND], [a, b + _AROUND, a + _AROUND]]
+        faces = np.concatenate([np.stack(three, axis=-1).reshape(-1, 3) for three in corners])
+        self.mean_skin = Surface(self._list_points(self.shape), faces)
 
     def to_inputs(self, numbers: Array) -> Array:
         middle = np.array([getattr(self.shape, name) for name in self.names])
@@ -76,20 +79,13 @@ class PhantomLimbs(LimbSource):
         points = compute_surface_point(shape, *np.meshgrid(angle, height))
         return np.asarray(points, dtype=np.float64).reshape(-1, 3)
 
-    @cached_property
-    def mean_skin(self) -> Surface | None:
-        rows, around = np.arange(_ALONG - 1)[:, None] * _AROUND, np.arange(_AROUND)
-        a, b = rows + around, rows + np.roll(around, -1)
-        corners = [[a, b, b + _AROUND], [a, b + _AROUND, a + _AROUND]]
-        faces = np.concatenate([np.stack(three, axis=-1).reshape(-1, 3) for three in corners])
-        return Surface(self._list_points(self.shape), faces)
-
 
 class ModelLimbs(LimbSource):
     """Limbs of a shape model: scores of its modes are normal, cut off at `FARTHEST`."""
 
     def __init__(self, file: Path, modes: int | None) -> None:
         self.model = ShapeModel.read(file)
+        self.mean_skin = self.model.mean.extract("skin")
         there = len(self.model.modes)
         if modes is not None and modes > there:
             raise InputError(f"the model has {there} modes", file=file, remedy="lower shapes.modes")
@@ -102,10 +98,6 @@ class ModelLimbs(LimbSource):
         limb = self.model.draw(inputs)
         surfaces = {name: limb.extract(name) for name in limb.faces}
         return DrawnLimb(surfaces, surfaces["skin"].points)
-
-    @cached_property
-    def mean_skin(self) -> Surface | None:
-        return self.model.mean.extract("skin")
 
 
 class FolderLimbs(LimbSource):

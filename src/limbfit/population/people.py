@@ -5,7 +5,6 @@ The sequence is nested: more people extend it, and every rule has the same peopl
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -33,13 +32,10 @@ _SAFE = 1e-9  # numbers stay so far from 0 and 1, where a normal score is infini
 
 @dataclass(frozen=True)
 class Person:
-    """A drawn person: ``inputs`` by name; ``tissues`` are parameters that replace those of the study."""
+    """A drawn person: ``inputs`` by name, and the thickness of the liner, also where all have the same."""
 
     number: int
     inputs: Mapping[str, float]
-    limb: Array
-    tissues: Mapping[str, float]
-    weight_N: float
     liner_mm: float
 
 
@@ -82,37 +78,30 @@ class People:
             raise InputError("nothing was identified", file=study.file, remedy="limbfit run first")
         found, _ = choose_parameters(study)
         covariance = np.array(Store(study.results).results.calibration.uncertainty.covariance_log)
-        self._take_tables(study)
+        for name in ("geometry", "material"):  # of that study, where the trial does not state its own
+            keys = {"layers", "core", "skin_layer_mm"} if name == "geometry" else None
+            stated = getattr(study, name).model_dump(mode="json", include=keys, exclude_unset=True)
+            self.tables[name] = stated | self.tables.get(name, {})
         value, vector = np.linalg.eigh(covariance)  # some parameters may be held: it has no Cholesky factor
         names = [".".join(name) for name in list_flat_names(study.tissues, study.material.law)]
         return names, study.vector(found), vector * np.sqrt(np.clip(value, 0.0, None))
 
-    def _take_tables(self, study: Study) -> None:
-        """Layers and law are those of the identified study, where the trial does not state its own."""
-        for name in ("geometry", "material"):
-            keys = {"layers", "core", "skin_layer_mm"} if name == "geometry" else None
-            stated = getattr(study, name).model_dump(mode="json", include=keys, exclude_unset=True)
-            self.tables[name] = stated | self.tables.get(name, {})
-
-    @cached_property
-    def _dimensions(self) -> int:
-        return len(self.source.names) + len(self.tissue_names) + 2
-
     def draw(self, number: int) -> Person:
         """The person with a number. The first n of a trial are the same however many follow."""
-        sequence = qmc.Sobol(self._dimensions, seed=self.trial.population.seed)
+        ends = np.cumsum([len(self.source.names), len(self.tissue_names), 2])
+        sequence = qmc.Sobol(ends[-1], seed=self.trial.population.seed)
         if number > 1:
             sequence.fast_forward(number - 1)
         u = np.clip(sequence.random(1)[0], _SAFE, 1.0 - _SAFE)
-        shapes, tissues, last = np.split(u, np.cumsum([len(self.source.names), len(self.tissue_names)]))
-        limb = self.source.to_inputs(shapes)
+        shapes, tissues, last = np.split(u, ends[:-1])
         values = self._medians * np.exp(self._spread @ norm.ppf(tissues))
         weight = self.trial.weight.median_N * self.trial.weight.factor ** float(norm.ppf(last[0]))
         liner = self._liners[0] + (self._liners[1] - self._liners[0]) * float(last[1])
-        known = dict(zip(self.tissue_names, map(float, values), strict=True))
-        inputs = dict(zip(self.source.names, map(float, limb), strict=True)) | known
-        inputs |= {WEIGHT: weight} | ({LINER: liner} if LINER in self.names else {})
-        return Person(number, inputs, limb, known, weight, liner)
+        found = [*self.source.to_inputs(shapes), *values, weight, liner]
+        inputs = {
+            name: float(value) for name, value in zip(self.names, found)
+        }  # without a liner that all have
+        return Person(number, inputs, liner)
 
     def to_features(self, inputs: Array) -> Array:
         """Inputs (..., d) for a surrogate: of tissues and weight, which are lognormal, the logarithms."""
@@ -121,7 +110,7 @@ class People:
 
     def build_limb(self, person: Person, folder: Path) -> DrawnLimb:
         """Build a person's limb, and write its surfaces into ``folder / SURFACES``."""
-        limb = self.source.build(person.limb)
+        limb = self.source.build(np.array([person.inputs[name] for name in self.source.names]))
         (folder / SURFACES).mkdir(parents=True, exist_ok=True)
         for name, surface in limb.surfaces.items():
             write_surface(folder / SURFACES / f"{name}.stl", surface)
@@ -137,6 +126,8 @@ class People:
         bones = {name: f"../{SURFACES}/{name}.stl" for name in limb.surfaces if name != "skin"}
         socket = self.tables.get("socket", {}) | rule.socket
         bears_weight = any("preset" in load for load in socket.get("loads", [{"preset": None}]))
+        thickness = round(person.liner_mm, 3)  # one without thickness has no material
+        material = {"material": self.trial.liner.material} if thickness else {}
         content = {
             "study": {"name": f"{self.trial.population.name}, person {person.number}, {rule.name}"},
             **{name: table for name, table in self.tables.items() if name != "socket"},
@@ -146,8 +137,8 @@ class People:
                 {"name": "1", "position": front.round(3).tolist(), "depth_mm": 5.0}
             ],  # studies have one
             "socket": socket
-            | ({"body_weight_N": round(person.weight_N, 3)} if bears_weight else {})
-            | {"liner": self.trial.build_liner_table(round(person.liner_mm, 3))},
+            | ({"body_weight_N": round(person.inputs[WEIGHT], 3)} if bears_weight else {})
+            | {"liner": {"thickness_mm": thickness} | material},
         }
         folder.mkdir(parents=True, exist_ok=True)
         (folder / "study.toml").write_text(tomlkit.dumps(content), encoding="utf-8")
@@ -156,10 +147,10 @@ class People:
     def choose_parameters(self, person: Person, study: Study) -> Parameters:
         """Parameters of a person's tissues: those drawn, the others as the study starts them."""
         values = {tissue: dict(study.material.get(tissue, "start")) for tissue in study.tissues}
-        for name, value in person.tissues.items():
+        for name in self.tissue_names:
             tissue, key = name.split(".")
             if key in values[tissue]:
-                values[tissue][key] = value
+                values[tissue][key] = person.inputs[name]
         return values
 
     def check_limb(self, anatomy: Anatomy) -> None:

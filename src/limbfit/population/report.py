@@ -49,9 +49,8 @@ def _list_key_numbers(found: PopulationResult) -> tuple[KeyNumber, ...]:
 
 
 def _list_sections(trial: Trial, found: PopulationResult) -> list[Section]:
-    load = found.quantities[-1].load if found.quantities else ""
-    loads = list(dict.fromkeys(one.load for one in found.quantities if one.load != "donning"))
-    load = loads[-1] if loads else load
+    loads = [one.load for one in found.quantities]
+    load = next((one for one in reversed(list(dict.fromkeys(loads))) if one != "donning"), loads[-1])
     under = [one for one in found.quantities if one.load == load]
     regional = [one for one in under if one.quantity == "mean_kPa"]
     robust = found.robust

@@ -15,7 +15,7 @@ from ..arrays import Array
 from ..errors import InputError, RunError
 from ..pipeline.engine.context import Listener
 from ..results.population import RobustRule
-from .answers import find_worst, fit_surrogate, resample_interval
+from .answers import build_table, find_worst, fit_surrogate, resample_interval
 from .people import People
 from .running import DONE, FIRST_APART, PersonJob, TrialStore, run_jobs, run_people
 from .trial import RuleTable, Trial
@@ -61,7 +61,7 @@ def find_robust_rule(trial: Trial, people: int, fresh: int, listener: Listener) 
         rows = rows[(rows["person"] == job.number) & (rows["state"] == DONE)]
         if len(rows):
             inputs.append([*draw_features(job.number), *values])
-            outputs.append(_find_worst_of(rows)[0])
+            outputs.append(find_worst(build_table(rows, [job.number])[job.rules[0].name])[0])
     if len(outputs) < LEAST_PEOPLE:
         raise RunError(f"{trial.file}: only {len(outputs)} of {people} people could be simulated")
     surrogate = fit_surrogate(np.array(inputs), np.array(outputs))
@@ -75,9 +75,8 @@ def find_robust_rule(trial: Trial, people: int, fresh: int, listener: Listener) 
     chosen = change_rule(trial, keys, found.x)
     pair, first = (trial.rules[0], chosen), FIRST_APART + people
     numbers = run_people(trial, fresh, rules=pair, first=first, listener=listener)
-    rows = store.read(pair)
-    rows = rows[rows["person"].isin(numbers)]
-    before, after = (_find_worst_of(rows[rows["rule"] == rule.name]) for rule in pair)
+    table = build_table(store.read(pair), numbers)
+    before, after = (find_worst(table[rule.name]) for rule in pair)
     seen = np.array([[*draw_features(number), *found.x] for number in numbers])
     return RobustRule(
         keys=dict(zip(keys, map(float, found.x), strict=True)),
@@ -88,14 +87,6 @@ def find_robust_rule(trial: Trial, people: int, fresh: int, listener: Listener) 
         difference_kPa=float((after - before).mean()),
         interval_kPa=resample_interval(after - before, lambda drawn: drawn.mean(axis=-1)),
         surrogate_error_kPa=float(np.sqrt(((surrogate.predict(seen) - after) ** 2).mean())),
-    )
-
-
-def _find_worst_of(rows: object) -> Array:
-    """The worst pressure of each person of stored rows of one rule."""
-    values = rows[rows["load"] != ""]  # type: ignore[index]
-    return find_worst(
-        values.pivot_table(index="person", columns=["load", "place", "quantity"], values="value")
     )
 
 

@@ -229,7 +229,13 @@ def run_people(
     ended, following = list[int](), first
     while len(ended) < wanted:
         if following - first >= _MOST_DRAWN * wanted + 8:
-            raise RunError(_describe_losses(store, chosen, len(ended), following - first))
+            rows = store.read(chosen)
+            lost = rows[rows["state"] != DONE].drop_duplicates(["person", "rule"])
+            reason = (
+                "" if lost.empty else f"; the last one: {lost.iloc[-1]['state']}, {lost.iloc[-1]['text']}"
+            )
+            counts = f"{len(ended)} of {following - first}"
+            raise RunError(f"{trial.file}: only {counts} people could be simulated{reason}")
         numbers = range(following, following + wanted - len(ended))
         run_jobs([PersonJob(trial, chosen, n) for n in numbers], len(ended), wanted, listener)
         following = numbers.stop
@@ -268,10 +274,3 @@ def list_done(rows: Any, rules: Sequence[RuleTable]) -> list[int]:
     """The numbers of the people who wear the socket of every rule, by the stored rows."""
     done = rows[rows["state"] == DONE].groupby("person")["rule"].nunique()
     return sorted(int(number) for number in done[done == len(rules)].index)
-
-
-def _describe_losses(store: TrialStore, rules: Sequence[RuleTable], ended: int, drawn: int) -> str:
-    rows = store.read(rules)
-    lost = rows[rows["state"] != DONE].drop_duplicates(["person", "rule"])
-    reason = "" if lost.empty else f"; the last one: {lost.iloc[-1]['state']}, {lost.iloc[-1]['text']}"
-    return f"{store.trial.file}: only {ended} of {drawn} people could be simulated{reason}"

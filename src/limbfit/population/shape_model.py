@@ -99,7 +99,7 @@ def build_shape_model(
     paths = [Path(path) for path in (*([mean] if mean is not None else []), *limbs)]
     if len(paths) < (2 if mean is not None else 3):
         raise InputError(f"{len(limbs)} limbs are too few", remedy="give three or more, or a mean and one")
-    found, registrations = register_limbs(paths, unit) if register else (read_bodies(paths, unit), [])
+    found, distances = register_limbs(paths, unit) if register else (read_bodies(paths, unit), [])
     sizes = [float(np.linalg.norm(np.ptp(one.points, axis=0))) for one in found]
     odd = next((i for i, size in enumerate(sizes) if not 0.2 < size / np.median(sizes) < 5.0), None)
     if odd is not None:
@@ -123,8 +123,8 @@ def build_shape_model(
         deviation_mm=np.sqrt(variance / len(middle)).tolist(),
         left_out_mm=left_out,
         specificity_mm=specificity,
-        registration_rms_mm=max((one.rms_mm for one in registrations), default=None),
-        registration_p95_mm=max((one.p95_mm for one in registrations), default=None),
+        registration_rms_mm=max((float(np.sqrt((one**2).mean())) for one in distances), default=None),
+        registration_p95_mm=max((float(np.percentile(one, 95)) for one in distances), default=None),
     )
     return ShapeModel(LimbBodies(middle, found[0].faces), modes, figures)
 

@@ -133,11 +133,6 @@ class Trial(TomlFile):
         if own := sorted({"study", "surfaces", "image", "sites", "execution"}.intersection(self.person)):
             raise ValueError(f"person: the table {own[0]} is written for each person; leave it out")
 
-    def build_liner_table(self, thickness_mm: float) -> dict[str, Any]:
-        """The table ``[socket.liner]`` of a person; one without thickness has no material."""
-        table: dict[str, Any] = {"thickness_mm": thickness_mm}
-        return table | ({"material": self.liner.material} if thickness_mm else {})
-
 
 def load_trial(path: str | Path) -> Trial:
     """Read and check a trial; ``path`` is its file or folder.

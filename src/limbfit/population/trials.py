@@ -9,7 +9,7 @@ from ..pipeline.commands.run import report_study
 from ..pipeline.engine.context import Listener, Progress, ignore_progress
 from ..pipeline.engine.store import write_result
 from ..pipeline.limb.surfaces import read_given_anatomy
-from ..results.population import PopulationResult
+from ..results.population import PopulationResult, RobustRule
 from ..study import load_study
 from .answers import measure_precision, summarise_trial
 from .people import People
@@ -155,12 +155,11 @@ def report_population(path: str | Path) -> dict[str, Any]:
     """Write answers and report anew from what is stored; as `run_population`."""
     trial = load_trial(path)
     before = PopulationResult.find(trial.results)
-    return _store(trial, summarise_trial(trial, before.robust if before else None))
+    return _store_answers(trial, before.robust if before else None)
 
 
-def _store(trial: Trial, found: PopulationResult) -> dict[str, Any]:
-    if not found.people:
-        raise InputError("nobody was simulated yet", file=trial.file, remedy="limbfit population run first")
+def _store_answers(trial: Trial, robust: RobustRule | None) -> dict[str, Any]:
+    found = summarise_trial(trial, robust)
     write_result(trial.results / PopulationResult.FILE, found)
     return found.to_plain() | {"report": str(write_report(trial, found)), "folder": str(trial.results)}
 
@@ -233,4 +232,4 @@ def make_robust(
     trial = load_trial(path)
     run_people(trial, 2, listener=listener)  # the answers of the trial itself stand beside the rule
     robust = find_robust_rule(trial, people, fresh, listener)
-    return _store(trial, summarise_trial(trial, robust))
+    return _store_answers(trial, robust)

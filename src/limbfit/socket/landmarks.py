@@ -128,7 +128,6 @@ def find_load_point(anatomy: Anatomy, brim: Array) -> Array:
 class SkinRegion:
     """A part of the skin: its middle on the skin (LPS mm) and the skin's faces that belong to it (m,)."""
 
-    name: str
     position: Array
     faces: Mask
 
@@ -153,7 +152,7 @@ def build_default_regions(anatomy: Anatomy, directions: Directions) -> dict[str,
         if mask.any():
             centre = np.average(middles[mask], axis=0, weights=skin.face_areas[mask])
             nearest = np.flatnonzero(mask)[np.linalg.norm(middles[mask] - centre, axis=1).argmin()]
-            regions[name] = SkinRegion(name, middles[nearest], mask)
+            regions[name] = SkinRegion(middles[nearest], mask)
     return regions
 
 
@@ -168,7 +167,7 @@ def build_stated_region(anatomy: Anatomy, name: str, position: Array, radius_mm:
             f"region {name!r} lies {np.sqrt(squared[0]):.0f} mm off the skin",
             remedy="give a position on the skin (LPS, mm)",
         )
-    return SkinRegion(name, foot[0], _select_disc(skin, foot[0], radius_mm, skin.face_normals[face[0]]))
+    return SkinRegion(foot[0], _select_disc(skin, foot[0], radius_mm, skin.face_normals[face[0]]))
 
 
 def _select_disc(skin: Surface, middle: Array, radius_mm: float, outward: Array) -> Mask:

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from typing import ClassVar, Self
 
 import numpy as np
@@ -61,18 +60,17 @@ class Area:
         """(3,) the middle, LPS mm."""
         return self.points.mean(axis=0)
 
-    @cached_property
-    def _tree(self) -> KDTree:
-        return KDTree(self.points)
-
     def depth(self, points: Array) -> Array:
         """(n,) mm at points (n, 3)."""
         return self.depth_mm * self.share(points)
 
     def share(self, points: Array) -> Array:
         """(n,) of its depth at points (n, 3), which fades without a kink in slope or curvature."""
-        apart = self._tree.query(points)[0] / self.radius_mm
-        return np.asarray(np.maximum(1.0 - apart**2, 0.0) ** 3)
+        return np.asarray(np.maximum(1.0 - self.relative_distance(points) ** 2, 0.0) ** 3)
+
+    def relative_distance(self, points: Array) -> Array:
+        """Distances (...) of points (..., 3) from it over its radius."""
+        return np.asarray(KDTree(self.points).query(points)[0] / self.radius_mm)
 
     def project_to(self, face: Surface) -> Self:
         """Put its points on the drawn face (LPS), which a liner keeps off the skin; leave out those off it.
@@ -95,10 +93,6 @@ class Area:
     def max_beside_mm(self) -> float:
         """How far beside the face a point may lie."""
         return max(MAX_BESIDE_MM, 0.25 * self.radius_mm)
-
-    def compute_relative_distance(self, point: Array) -> float:
-        """Distance of a point (3,) from it over its radius."""
-        return float(self._tree.query(point)[0] / self.radius_mm)
 
 
 class Zone(Area):

@@ -8,12 +8,11 @@ station cannot fold. `Offsets` are moves along them, such as the shape that pres
 along them a face is moved clear of the limb.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from scipy.interpolate import RegularGridInterpolator
+from scipy.interpolate import interpn
 from scipy.ndimage import gaussian_filter
 from scipy.sparse import csr_array
 
@@ -110,19 +109,14 @@ class LimbProfile:
 
     def find_radius(self, angle: Array, station: Array) -> Array:
         """Radii (...) at angles and stations, mm; those beyond the last station are the last one's."""
-        return self.interpolate_field(self.radius)(angle, station)
+        return self.interpolate(self.radius, angle, station)
 
-    def interpolate_field(self, field: Array) -> Callable[[Array, Array], Array]:
-        """A field (k, ANGLES) as a function of angle and station."""
-        angles = np.append(self.angles, np.pi)
-        grid = RegularGridInterpolator((self.stations, angles), np.column_stack([field, field[:, 0]]))
-
-        def value(angle: Array, station: Array) -> Array:
-            turned = np.mod(angle + np.pi, 2 * np.pi) - np.pi
-            clipped = np.clip(station, self.stations[0], self.stations[-1])
-            return np.asarray(grid(np.stack(np.broadcast_arrays(clipped, turned), axis=-1)))
-
-        return value
+    def interpolate(self, field: Array, angle: Array, station: Array) -> Array:
+        """A field (k, ANGLES) at angles and stations (...)."""
+        grid = self.stations, np.append(self.angles, np.pi)
+        turned = np.mod(angle + np.pi, 2 * np.pi) - np.pi
+        at = np.broadcast_arrays(np.clip(station, self.stations[0], self.stations[-1]), turned)
+        return np.asarray(interpn(grid, np.column_stack([field, field[:, 0]]), np.stack(at, axis=-1)))
 
 
 @lru_cache(maxsize=4)
@@ -211,7 +205,7 @@ class Offsets:
     def moves(self, points: Array) -> Array:
         """Moves (n, 3) of points (n, 3) of the limb frame, along their rays."""
         angle, station, _ = self.limb.rays.coordinates(points)
-        size = self.limb.interpolate_field(self.radial)(angle, station)
+        size = self.limb.interpolate(self.radial, angle, station)
         return np.asarray(size[:, None] * self.limb.rays.direction(angle, station))
 
 
@@ -268,10 +262,7 @@ def _compute_moves(points: Array, faces: Indices, limb: Surface) -> Array:
     for corners in ((0, 1), (1, 2), (2, 0), (0, 1, 2)):
         ends = faces[:, list(corners)]
         short = np.maximum(TARGET_MM - limb.signed_distance(points[ends].mean(axis=1)), 0.0)
-        for end in ends.T:
-            np.maximum.at(need, end, short)
+        np.maximum.at(need, ends, short[:, None])
     squared, nearest, _ = Surface(points, faces).find_nearest(limb.points)
-    short = np.maximum(TARGET_MM - np.sqrt(squared), 0.0)
-    for end in faces[nearest].T:
-        np.maximum.at(need, end, short)
+    np.maximum.at(need, faces[nearest], np.maximum(TARGET_MM - np.sqrt(squared), 0.0)[:, None])
     return need

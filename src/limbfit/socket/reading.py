@@ -17,7 +17,7 @@ from ..anatomy.surfaces.triangles import (
     open_loops,
     remove_unused_points,
 )
-from ..arrays import Array, Indices
+from ..arrays import Indices
 from ..errors import SurfaceError, add_location
 from .rays import Rays, apply_clearance, compute_profile
 from .shape import Socket, refuse_bones
@@ -145,18 +145,13 @@ def _compute_facing(face: Surface, rays: Rays) -> float:
     return mean
 
 
-def _count_windings(loop: Array, rays: Rays) -> int:
-    """Count how often a closed line (k, 3) goes around the middle line."""
-    angle = rays.coordinates(loop)[0]
-    steps = np.mod(np.diff(angle, append=angle[0]) + np.pi, 2 * np.pi) - np.pi
-    return round(float(steps.sum()) / (2 * np.pi))
-
-
 def _find_brim(face: Surface, rays: Rays) -> tuple[Indices, bool]:
     """Find the proximal edge, and whether the distal end is open too."""
-    loops = open_loops(face)
-    around = [loop for loop in loops if _count_windings(face.points[loop], rays)]
-    holes = [loop for loop in loops if not _count_windings(face.points[loop], rays)]
+    around, holes = list[Indices](), list[Indices]()
+    for loop in open_loops(face):
+        angle = rays.coordinates(face.points[loop])[0]
+        steps = np.mod(np.diff(angle, append=angle[0]) + np.pi, 2 * np.pi) - np.pi
+        (around if round(float(steps.sum()) / (2 * np.pi)) else holes).append(loop)
     if holes:
         raise SurfaceError(
             f"the socket has a hole of {len(holes[0])} edges in its side",

@@ -6,6 +6,7 @@ between rings of points around the limb.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Literal
 
 import numpy as np
@@ -72,11 +73,6 @@ class TrimmedLimb:
         low, high = self.ways[rows, after - 1], self.ways[rows, after]
         share = ((way - low) / (high - low))[:, None]
         return np.asarray((1 - share) * self.meridians[rows, after - 1] + share * self.meridians[rows, after])
-
-    def tangent(self, way: Array, reach: float = 3.0) -> Array:
-        """(angles, 3) unit vectors along the meridians, towards the brim, over some mm."""
-        step = self.find_points(way + reach) - self.find_points(way - reach)
-        return np.asarray(step / np.linalg.norm(step, axis=1, keepdims=True))
 
 
 def trim_limb(limb: LimbProfile, frame: Frame, trim: Trim) -> TrimmedLimb:
@@ -194,7 +190,9 @@ class Recipe:
 
 @dataclass(frozen=True, eq=False)
 class SocketSurface:
-    """Triangles on the limb, and how far each point lies below the brim along the limb, mm."""
+    """Triangles on the limb; of each point how far it lies below the brim along the limb, mm, and the unit
+    vector towards it.
+    """
 
     points: Array
     faces: Indices
@@ -276,30 +274,22 @@ def _draw_surface(lines: TrimmedLimb, recipe: Recipe) -> SocketSurface:
     below, up = [np.array([lengths.mean()])], [np.zeros((1, 3))]
     for number, way in enumerate(shares):
         dense = lines.find_points(way)
-        count = max(MIN_RING_POINTS, round(_close_ring(dense)[1][-1] / recipe.edge_mm))
-        points, where = _resample_ring(dense, count, 0.5 * (number % 2))
-        rings.append(points)
+        closed = np.vstack([dense, dense[:1]])
+        length = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(closed, axis=0), axis=1)))
+        share, count = length / length[-1], max(MIN_RING_POINTS, round(length[-1] / recipe.edge_mm))
+        where = (np.arange(count) + 0.5 * (number % 2)) / count  # of every other ring half a step on
         at.append(where)
-        remaining = np.column_stack([dense[:, :2], lengths - way])
-        below.append(_interpolate_along_ring(dense, remaining[:, 2:], where)[:, 0])
-        up.append(_interpolate_along_ring(dense, lines.tangent(way), where))
-    faces = _join_all_rings(at)
+        rings.append(CubicSpline(share, closed, bc_type="periodic")(where))
+        upwards = lines.find_points(way + 3.0) - lines.find_points(way - 3.0)
+        upwards /= np.linalg.norm(upwards, axis=1, keepdims=True)
+        fields = np.column_stack([lengths - way, upwards])
+        values = [np.interp(where, share[:-1], field, period=1.0) for field in fields.T]
+        below.append(values[0])
+        up.append(np.column_stack(values[1:]))
+    faces = _join_rings(at)
     count = sum(len(ring) for ring in rings)
     brim = np.arange(count - len(rings[-1]), count)
     return SocketSurface(np.vstack(rings), faces, np.concatenate(below), np.vstack(up), brim)
-
-
-def _interpolate_along_ring(dense: Array, values: Array, shares: Array) -> Array:
-    """Interpolate values (n, d) at the points of a dense ring at shares of its length."""
-    _, length = _close_ring(dense)
-    around = np.vstack([values, values[:1]])
-    return np.column_stack([np.interp(shares, length / length[-1], column) for column in around.T])
-
-
-def _close_ring(ring: Array) -> tuple[Array, Array]:
-    """Return a ring (n, 3) with its first point again at its end, and its length up to each point, mm."""
-    closed = np.vstack([ring, ring[:1]])
-    return closed, np.append(0.0, np.cumsum(np.linalg.norm(np.diff(closed, axis=0), axis=1)))
 
 
 def _rectify_points(surface: SocketSurface, limb: LimbProfile, frame: Frame, recipe: Recipe) -> Array:
@@ -350,53 +340,29 @@ def _refuse_crossing(face: Surface, recipe: Recipe) -> None:
     if not len(crossing):
         return
     place = face.triangles[crossing[0, 0]].mean(axis=0)
-    near = min(recipe.areas, key=lambda area: area.compute_relative_distance(place), default=None)
+    near = min(recipe.areas, key=lambda area: float(area.relative_distance(place)), default=None)
     remedy = "lower reduction_percent or flare_mm"
     if near is not None:
         remedy = f"lower the depth of {near.name!r} or make it wider"
     raise SurfaceError(f"the socket's face would cross itself at {format_place(place, 0)}", remedy=remedy)
 
 
-def _resample_ring(ring: Array, count: int, turn: float) -> tuple[Array, Array]:
-    """``count`` points evenly spaced along a dense closed ring (n, 3), from the share ``turn`` of a step on.
+def _join_rings(shares: Sequence[Array]) -> Indices:
+    """Triangles between rings whose points lie at these shares of each; the first ring is a point.
 
-    Returns
-    -------
-    points : (count, 3) on the periodic cubic spline through the ring.
-    shares : (count,) of the ring's length at which they lie.
+    Points are numbered one ring after the other. Seen from inside, where shares grow clockwise about the
+    upward axis from without, the triangles run counter-clockwise.
     """
-    closed, length = _close_ring(ring)
-    shares = (np.arange(count) + turn) / count
-    return CubicSpline(length / length[-1], closed, bc_type="periodic")(shares), shares
-
-
-def _join_rings(lower: Array, upper: Array, first: int, second: int) -> Indices:
-    """Triangles between two rings whose points lie at shares ``lower`` (a,) and ``upper`` (b,) of them.
-
-    The points of the rings are numbered from ``first`` and ``second`` on. Seen from inside, where shares grow
-    clockwise about the upward axis from without, the triangles run counter-clockwise.
-    """
-    a, b = len(lower), len(upper)
-    faces, i, j = [], 0, 0
-    ends = np.append(lower, lower[0] + 1.0), np.append(upper, upper[0] + 1.0)
-    while i < a or j < b:
-        step_lower = j >= b or (i < a and ends[0][i + 1] <= ends[1][j + 1])
-        low, high = first + i % a, second + j % b
-        if step_lower:
-            i += 1
-            faces.append([low, high, first + i % a])
-        else:
-            j += 1
-            faces.append([low, high, second + j % b])
-    return np.array(faces, dtype=np.int64)
-
-
-def _join_all_rings(shares: Sequence[Array]) -> Indices:
-    """Triangles between rings, the first of which is a point, numbered one ring after the other."""
-    starts = np.cumsum([0, *(len(ring) for ring in shares)])
+    starts = np.cumsum([len(ring) for ring in shares])
     around = np.arange(len(shares[1]))
-    pole = np.column_stack([np.zeros_like(around), 1 + around, 1 + np.roll(around, -1)])
-    bands = [
-        _join_rings(shares[k], shares[k + 1], starts[k], starts[k + 1]) for k in range(1, len(shares) - 1)
-    ]
-    return np.vstack([pole, *bands])
+    faces = [np.column_stack([np.zeros_like(around), 1 + around, 1 + np.roll(around, -1)])]
+    for (first, lower), (second, upper) in pairwise(zip(starts, shares[1:])):
+        a, b = len(lower), len(upper)
+        # Both rings are walked at once: the one whose next point comes first goes on to it.
+        ends = np.concatenate([lower[1:], lower[:1] + 1.0, upper[1:], upper[:1] + 1.0])
+        is_lower = np.argsort(ends, kind="stable") < a
+        i: Indices = np.cumsum(is_lower) - is_lower
+        j: Indices = np.arange(a + b) - i
+        ahead = np.where(is_lower, first + (i + 1) % a, second + (j + 1) % b)
+        faces.append(np.column_stack([first + i % a, second + j % b, ahead]))
+    return np.vstack(faces)

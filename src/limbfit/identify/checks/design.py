@@ -62,13 +62,6 @@ class NoiseModel:
         if self.sensor_N == 0 and self.misfit == 0:
             raise CalibrationError("a design needs some noise: without any, one site determines everything")
 
-    def covariance_row(self, force_N: Array) -> Array:
-        """First row (n,) of the covariance of a record, which is a Toeplitz matrix."""
-        n = len(force_N)
-        drift = (self.misfit * float(np.abs(force_N).max())) ** 2 * self.correlation ** np.arange(n)
-        drift[0] += self.sensor_N**2
-        return np.asarray(drift + self.bias_N**2, dtype=np.float64)
-
 
 @dataclass(frozen=True)
 class Candidate:
@@ -81,8 +74,10 @@ class Candidate:
 
 def compute_information(response: SiteResponse, parameters: Array, noise: NoiseModel) -> Array:
     """Return the Fisher information (p, p) on log(parameters) of a simulated response."""
-    scaled = response.jacobian * parameters
-    information = scaled.T @ solve_toeplitz(noise.covariance_row(response.force_N), scaled)
+    scaled, force = response.jacobian * parameters, response.force_N
+    drift = (noise.misfit * float(np.abs(force).max())) ** 2 * noise.correlation ** np.arange(len(force))
+    drift[0] += noise.sensor_N**2
+    information = scaled.T @ solve_toeplitz(drift + noise.bias_N**2, scaled)
     return np.asarray((information + information.T) / 2)
 
 
@@ -225,42 +220,27 @@ def _improve(
         chosen = best
 
 
-@dataclass(frozen=True)
 class RecordNoise:
     """The noise of all that a record measures; None where that is not measured.
 
     ``force`` is that of the force, ``layers`` of the compressions in ultrasound, ``skin`` of the moves that
-    cameras see, and ``waves`` of the speeds of shear waves.
+    cameras see, and ``waves`` of the speeds of shear waves; ``has_secondary`` if there is any beside the
+    force. Given are standard deviations of one reading at each point of comparison. The misfit of the model
+    is the same share as of the force. The speeds of a place have a common error as large as each one's own.
     """
 
-    force: NoiseModel
-    layers: NoiseModel | None = None
-    skin: NoiseModel | None = None
-    waves: NoiseModel | None = None
-
-    @classmethod
-    def from_sds(
-        cls,
+    def __init__(
+        self,
         force: NoiseModel,
         ultrasound_sd_mm: float | None = None,
         surface_sd_mm: float | None = None,
         shear_waves_sd_m_s: float | None = None,
-    ) -> RecordNoise:
-        """Build it from the standard deviations of one reading at each point of comparison.
-
-        The misfit of the model is the same share as of the force. The speeds of a place have a common error
-        as large as each one's own.
-        """
-        layers, skin, waves = (
-            None if sd is None else replace(force, sensor_N=sd)
-            for sd in (ultrasound_sd_mm, surface_sd_mm, shear_waves_sd_m_s)
-        )
-        return cls(force, layers, skin, None if waves is None else replace(waves, bias_N=waves.sensor_N))
-
-    @property
-    def has_secondary(self) -> bool:
-        """True if anything is measured beside the force."""
-        return any(one is not None for one in (self.layers, self.skin, self.waves))
+    ) -> None:
+        self.force = force
+        sds = ultrasound_sd_mm, surface_sd_mm, shear_waves_sd_m_s
+        self.layers, self.skin, waves = (sd if sd is None else replace(force, sensor_N=sd) for sd in sds)
+        self.waves = None if waves is None else replace(waves, bias_N=waves.sensor_N)
+        self.has_secondary = any(sd is not None for sd in sds)
 
     def compute_information(
         self,
@@ -278,28 +258,19 @@ class RecordNoise:
         """
         layers, points_mm, readings = parts
         information, waves = compute_information(force, parameters, self.force), layers + 3 * len(points_mm)
+        curves = [SiteResponse(*pair) for pair in zip(values, slopes, strict=True)]
         if self.layers is not None:
-            information = information + _sum_information(
-                values[:layers], slopes[:layers], parameters, self.layers
-            )
+            information += sum(compute_information(one, parameters, self.layers) for one in curves[:layers])
         if self.skin is not None and len(points_mm):
             components = np.tile(range(3), len(points_mm))
             similarity = compute_skin_similarity(np.repeat(points_mm, 3, axis=0), components)
             skin = values[layers:waves], slopes[layers:waves]
-            information = information + compute_field_information(*skin, similarity, parameters, self.skin)
+            information += compute_field_information(*skin, similarity, parameters, self.skin)
         if self.waves is not None:
             fewer = np.sqrt(max(values.shape[1] / readings, 1.0))  # than points of comparison
             noise = replace(self.waves, sensor_N=fewer * self.waves.sensor_N)
-            information = information + _sum_information(values[waves:], slopes[waves:], parameters, noise)
+            information += sum(compute_information(one, parameters, noise) for one in curves[waves:])
         return information
-
-
-def _sum_information(values: Array, slopes: Array, parameters: Array, noise: NoiseModel) -> Array:
-    """Return the information (p, p) of several curves (g, n) together."""
-    found = np.zeros((len(parameters), len(parameters)))
-    for value, slope in zip(values, slopes, strict=True):
-        found += compute_information(SiteResponse(value, slope), parameters, noise)
-    return found
 
 
 @dataclass(frozen=True)

@@ -94,18 +94,14 @@ def summarise_fit(records: Sequence[RecordFit]) -> str:
     off = [one for one in fitted if one.verdict]
     if not fitted:
         return ""
-    if not off:
-        what = "the model follows every fitted record within what noise, touch-down, mesh and site explain"
-        return what + _count_held_out(records)
-    worst = max(off, key=lambda one: max(p.times_noise for p in one.phases if _is_clear(p)))
-    also = f"; and {len(off) - 1} more of {len(fitted)} fitted records" if len(off) > 1 else ""
-    return worst.verdict + also + _count_held_out(records)
-
-
-def _count_held_out(records: Sequence[RecordFit]) -> str:
+    text = "the model follows every fitted record within what noise, touch-down, mesh and site explain"
+    if off:
+        text = max(off, key=lambda one: max(p.times_noise for p in one.phases if _is_clear(p))).verdict
+        text += f"; and {len(off) - 1} more of {len(fitted)} fitted records" if len(off) > 1 else ""
     held = [one for one in records if not one.fitted and one.inside_95 is not None]
-    off = [one for one in held if one.verdict]
-    return f"; {len(off)} of {len(held)} held-out records lie mostly outside their 95 % band" if off else ""
+    if missed := sum(bool(one.verdict) for one in held):
+        text += f"; {missed} of {len(held)} held-out records lie mostly outside their 95 % band"
+    return text
 
 
 def _whiten(rows: Array, covariance: Array) -> Array:

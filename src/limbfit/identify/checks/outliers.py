@@ -336,14 +336,6 @@ def _build_correction(
     return RecordCorrection(kind, indices, cause, gain, *errors, float(before.max()), fits)
 
 
-@dataclass(frozen=True)
-class OutlierReport:
-    """The errors of all sites left out, with the records named as given, and the warnings."""
-
-    left_out: tuple[LeftOutRecord, ...]
-    warnings: tuple[RecordWarning, ...]
-
-
 def find_outliers(
     simulate: Simulate,
     measured: Sequence[MeasuredCurve],
@@ -352,8 +344,10 @@ def find_outliers(
     simulate_exchange: Callable[[Array, int, int], Exchanged],
     neutral: Array,
     tie: Array | None = None,
-) -> OutlierReport:
+) -> tuple[tuple[LeftOutRecord, ...], tuple[RecordWarning, ...]]:
     """Look for names exchanged, wrong units of force, and sites that do not fit, one after the other.
+
+    Returns the errors of all sites left out, with the records named as given, and the warnings.
 
     A convincing correction becomes a warning, and is applied before the next one is looked for, so that the
     rest is judged by correct records. With fewer than four sites there is no warning.
@@ -370,7 +364,7 @@ def find_outliers(
     tie : as `LeaveOutFits`.
     """
     if count_sites(measured) < MIN_SITES:
-        return OutlierReport((), ())
+        return (), ()
     model = LogLinearModel(start, simulate(start))
     fits = LeaveOutFits(model, measured, start, tie)
     errors = fits.leave_one_out()
@@ -385,16 +379,9 @@ def find_outliers(
         responses = model.responses
         return approximate_response(responses[i], one, two), approximate_response(responses[j], two, one)
 
-    warnings = _find_warnings(fits, approximate, partial(simulate_exchange, model.parameters))
-    return OutlierReport(errors, warnings)
-
-
-def _find_warnings(
-    fits: LeaveOutFits, approximate: Exchange, simulate: Exchange
-) -> tuple[RecordWarning, ...]:
-    warnings, measured = [], fits.measured
+    warnings, exchange = list[RecordWarning](), partial(simulate_exchange, model.parameters)
     for _ in range(_MAX_CORRECTIONS):
-        correction = find_best_correction(fits, approximate, simulate)
+        correction = find_best_correction(fits, approximate, exchange)
         if correction is None:
             break
         fits = correction.fits
@@ -402,7 +389,7 @@ def _find_warnings(
     singles, misfitting = find_misfitting_sites(fits)
     corrected_sites = {site for warning in warnings for site in warning.sites}
     others = (i for i in misfitting if measured[i].name not in corrected_sites)
-    return (*warnings, *(warn_of_outlier(singles[i], measured[i].unit) for i in others))
+    return errors, (*warnings, *(warn_of_outlier(singles[i], measured[i].unit) for i in others))
 
 
 def warn_of_outlier(error: LeftOutRecord, unit: str) -> RecordWarning:

@@ -210,16 +210,6 @@ def _check_all_moduli(facts: Sequence[RecordFacts]) -> Iterator[RecordWarning]:
     yield RecordWarning((), "unit", what, {"modulus_kPa": middle}, cause, "check the units of all records")
 
 
-def _compute_spreads(features: Array, has_thickness: bool) -> Array:
-    """Return robust standard deviations (4,) of sites about the others' median, at least the floors."""
-    floors = [
-        _MIN_SDS["modulus" if has_thickness else "stiffness"],
-        *(_MIN_SDS[k] for k in ("speed", "step", "depth")),
-    ]
-    deviation = 1.4826 * np.median(np.abs(features - np.median(features, axis=0)), axis=0)
-    return np.maximum(floors, deviation) * np.sqrt(1 + 1 / len(features))
-
-
 def _compare_records(facts: Sequence[RecordFacts]) -> Iterator[RecordWarning]:
     if len(facts) < _MIN_OTHERS + 1:
         return
@@ -227,10 +217,13 @@ def _compare_records(facts: Sequence[RecordFacts]) -> Iterator[RecordWarning]:
     if not known:
         facts = [replace(f, thickness_mm=None) for f in facts]
     table = np.log([[f.modulus_kPa, f.speed_mm_s, f.step_s, f.depth_mm] for f in facts])
-    away, spread = np.zeros_like(table), np.zeros_like(table)
+    away, spread = np.zeros_like(table), np.zeros_like(table)  # robust, from the median of the others
+    floors = [_MIN_SDS[key] for key in ("modulus" if known else "stiffness", "speed", "step", "depth")]
     for i in range(len(facts)):
         rest = np.delete(table, i, axis=0)
-        away[i], spread[i] = table[i] - np.median(rest, axis=0), _compute_spreads(rest, known)
+        middle = np.median(rest, axis=0)
+        scatter = np.maximum(floors, 1.4826 * np.median(np.abs(rest - middle), axis=0))
+        away[i], spread[i] = table[i] - middle, scatter * np.sqrt(1 + 1 / len(rest))
     swapped = _find_exchange(facts, away[:, 0] / spread[:, 0]) if known else None
     if swapped is not None:
         yield swapped

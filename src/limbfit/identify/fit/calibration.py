@@ -168,7 +168,17 @@ def calibrate(
     for current in run.iterate_states(state):
         if on_iterate:
             on_iterate(current)
-    return run.build_result(current)
+    parameters = np.array(current.history[-1].parameters)
+    return Calibration(
+        names=unknowns.names,
+        sites=tuple(site.name for site in measured),
+        parameters=parameters,
+        stages=current.stages,
+        history=current.history,
+        evaluations=current.evaluations,
+        settings=run.settings,
+        responses=run.responses_at(parameters),
+    )
 
 
 def evaluate_state(
@@ -389,31 +399,20 @@ class _Search:
 
     def _make_paper_rule(self, space: SearchSpace) -> Callable[[SearchPoint, SearchPoint], str]:
         def stop(before: SearchPoint, after: SearchPoint) -> str:
-            if np.abs(space.expand(after.z) - space.expand(before.z)).max() < _PAPER_CHANGE:
+            first, second = space.expand(before.z), space.expand(after.z)
+            if np.abs(second - first).max() < _PAPER_CHANGE:
                 return "no parameter changed by more than 0.01"
-            change = self._compute_equation_8(space, after) - self._compute_equation_8(space, before)
-            if np.abs(change).max() < _PAPER_CHANGE:
-                return "no entry of the objective changed by more than 0.01"
-            return ""
+            # The paper's objective (sites,) in N^2, whatever objective the search follows.
+            old, new = (
+                compute_residuals("paper", self.responses_at(p), self.measured)[0] for p in (first, second)
+            )
+            return (
+                "no entry of the objective changed by more than 0.01"
+                if np.abs(new - old).max() < _PAPER_CHANGE
+                else ""
+            )
 
         return stop
-
-    def _compute_equation_8(self, space: SearchSpace, point: SearchPoint) -> Array:
-        """Return the paper's objective (sites,) in N^2, whatever objective the search follows."""
-        return compute_residuals("paper", self.responses_at(space.expand(point.z)), self.measured)[0]
-
-    def build_result(self, state: SearchState) -> Calibration:
-        parameters = np.array(state.history[-1].parameters)
-        return Calibration(
-            names=self.unknowns.names,
-            sites=tuple(site.name for site in self.measured),
-            parameters=parameters,
-            stages=state.stages,
-            history=state.history,
-            evaluations=state.evaluations,
-            settings=self.settings,
-            responses=self.responses_at(parameters),
-        )
 
 
 def move_answer(

@@ -139,11 +139,6 @@ class CorrectionRound:
     expected_percent: tuple[float | None, ...]
     reason: str = ""
 
-    def is_settled(self, allowed_percent: float) -> bool:
-        """True if every site was corrected and came out as expected."""
-        known = [one for one in self.expected_percent if one is not None]
-        return not self.reason and max(known, default=0.0) <= allowed_percent
-
 
 @dataclass(frozen=True)
 class CorrectionSettings:
@@ -154,29 +149,6 @@ class CorrectionSettings:
 
     rounds: int = 3
     tolerance_percent: float = 0.1
-
-
-@dataclass
-class _CorrectedModel:
-    """The corrected coarse model; it stores coarse responses, which the anchors need again.
-
-    Elements that fold in a coarse mesh are a property of that mesh and are corrected with the rest, so no
-    trial is refused for them.
-    """
-
-    coarse: Simulate
-    correction: MeshCorrection | None = None
-    _stored: dict[bytes, tuple[SiteResponse, ...]] = field(default_factory=dict)
-
-    def simulate_coarse(self, parameters: Array) -> tuple[SiteResponse, ...]:
-        key = parameters.tobytes()
-        if key not in self._stored:
-            self._stored[key] = tuple(replace(one, folded="") for one in self.coarse(parameters))
-        return self._stored[key]
-
-    def __call__(self, parameters: Array) -> Sequence[SiteResponse]:
-        responses = self.simulate_coarse(parameters)
-        return responses if self.correction is None else self.correction(responses)
 
 
 @dataclass(frozen=True)
@@ -217,7 +189,7 @@ def calibrate_with_correction(
     fidelity : when corrections end.
     """
     run = _CorrectionLoop(
-        _CorrectedModel(coarse),
+        coarse,
         fine,
         tuple(measured),
         unknowns,
@@ -229,14 +201,25 @@ def calibrate_with_correction(
     run.begin()
     for _ in run.stages:
         run.run_stage()
-    return run.build_result()
+    parameters = np.array(run.history[-1].parameters)
+    calibration = Calibration(
+        names=unknowns.names,
+        sites=tuple(site.name for site in measured),
+        parameters=parameters,
+        stages=run.ended,
+        history=run.history,
+        evaluations=run.state.evaluations,
+        settings=run.settings,
+        responses=tuple(run.simulate(parameters)),
+    )
+    return SearchResult(calibration, run.rounds)
 
 
 @dataclass
 class _CorrectionLoop:
     """The loop over stages and corrections; ``state`` is that of the inner calibration at its end."""
 
-    model: _CorrectedModel
+    coarse: Simulate
     fine: Simulate
     measured: tuple[MeasuredCurve, ...]
     unknowns: Unknowns
@@ -248,12 +231,30 @@ class _CorrectionLoop:
     history: tuple[Iterate, ...] = ()
     ended: tuple[StageResult, ...] = ()
     rounds: tuple[CorrectionRound, ...] = ()
+    correction: MeshCorrection | None = None
+    _stored: dict[bytes, tuple[SiteResponse, ...]] = field(default_factory=dict)
+
+    def simulate_coarse(self, parameters: Array) -> tuple[SiteResponse, ...]:
+        """Simulate on the coarse meshes; the anchors need the same responses again, so they are stored.
+
+        Elements that fold in a coarse mesh are a property of that mesh and are corrected with the rest, so no
+        trial is refused for them.
+        """
+        key = parameters.tobytes()
+        if key not in self._stored:
+            self._stored[key] = tuple(replace(one, folded="") for one in self.coarse(parameters))
+        return self._stored[key]
+
+    def simulate(self, parameters: Array) -> Sequence[SiteResponse]:
+        """Simulate on the coarse meshes, corrected."""
+        responses = self.simulate_coarse(parameters)
+        return responses if self.correction is None else self.correction(responses)
 
     def begin(self) -> None:
         """Correct at the start if it can be simulated: the ratio of fine to coarse forces changes little."""
         space = build_space(self.unknowns, self.stages[0])
         start = space.expand(space.reduce(np.log(self.unknowns.start)))
-        if not check_responses(self.model.simulate_coarse(start), self.measured, len(start)):
+        if not check_responses(self.simulate_coarse(start), self.measured, len(start)):
             self._anchor(-1, start)
 
     def run_stage(self) -> None:
@@ -266,10 +267,11 @@ class _CorrectionLoop:
         least = np.inf  # the cost of the fine forces there
         allowed = self.fidelity.tolerance_percent * (1.0 if is_last else _LOOSENING)
         for _ in range(self.fidelity.rounds):
-            loose = not is_last or self.model.correction is None
+            loose = not is_last or self.correction is None
             inner = self._search(stage, _LOOSENING if loose else 1.0)
             reached = self._correct(stage)
-            settled = reached.is_settled(allowed)
+            off = max((one for one in reached.expected_percent if one is not None), default=0.0)
+            settled = not reached.reason and off <= allowed
             if best is not None and not reached.reason and not settled and self._cost() > least:
                 self._step_half_way_back(stage, best[0])
                 reached = self._correct(stage)
@@ -277,12 +279,12 @@ class _CorrectionLoop:
                 reason = f"the correction fails: {reached.reason}"
                 break
             if self._cost() < least:
-                assert self.model.correction is not None
-                best, least = (self.state, self.model.correction), self._cost()
+                assert self.correction is not None
+                best, least = (self.state, self.correction), self._cost()
             if settled and not (is_last and loose):
                 break
         if best is not None and least < self._cost():
-            state, self.model.correction = best
+            state, self.correction = best
             end = replace(state.history[-1], evaluations=self.state.evaluations)
             self.history, self.state = (*self.history, end), replace(state, history=(end,))
         end = self.history[-1]
@@ -309,7 +311,7 @@ class _CorrectionLoop:
                 self.on_iterate(replace(state, history=whole, stages=self.ended))
 
         found = calibrate(
-            self.model,
+            self.simulate,
             self.measured,
             self.unknowns,
             replace(self.settings, relative_tolerance=loose * self.settings.relative_tolerance),
@@ -336,7 +338,7 @@ class _CorrectionLoop:
         if not found.reason:
             anchored = replace(self.state, radius=FIRST_RADIUS, stages=self.ended)
             here = evaluate_state(
-                self.model, self.measured, self.unknowns, self.settings, self.stages, anchored
+                self.simulate, self.measured, self.unknowns, self.settings, self.stages, anchored
             )
             self.history = (*self.history, here)
             self.state = replace(anchored, history=(here,))
@@ -344,7 +346,7 @@ class _CorrectionLoop:
 
     def _anchor(self, stage: int, parameters: Array) -> CorrectionRound:
         """Simulate the fine forces, and correct the model by them unless that fails."""
-        expected, coarse = self.model(parameters), self.model.simulate_coarse(parameters)
+        expected, coarse = self.simulate(parameters), self.simulate_coarse(parameters)
         for _ in range(_MAX_TRIES):
             fine = self.fine(parameters)
             if all(response.completed for response in fine):
@@ -363,19 +365,5 @@ class _CorrectionLoop:
         )
         self.rounds = (*self.rounds, found)
         if not reasons:
-            self.model.correction = correction
+            self.correction = correction
         return found
-
-    def build_result(self) -> SearchResult:
-        parameters = np.array(self.history[-1].parameters)
-        calibration = Calibration(
-            names=self.unknowns.names,
-            sites=tuple(site.name for site in self.measured),
-            parameters=parameters,
-            stages=self.ended,
-            history=self.history,
-            evaluations=self.state.evaluations,
-            settings=self.settings,
-            responses=tuple(self.model(parameters)),
-        )
-        return SearchResult(calibration, self.rounds)

@@ -27,7 +27,7 @@ from scipy.optimize import brentq, minimize
 from scipy.special import ndtr, stdtrit
 from scipy.stats import chi2
 
-from ...arrays import Array, Indices
+from ...arrays import Array
 from ...results.identification import MeshMisfitSummary, RecordResiduals, ResidualsSummary
 from ..fit.prediction import MAX_FREEDOM
 from .noise import SiteNoise
@@ -202,30 +202,22 @@ class ResidualModel:
             total += len(C) ** 2 / float(np.sum((C / np.outer(sd, sd)) ** 2))
         return total
 
-    def whiten(self) -> Spectrum:
-        """Return the coordinates in which noise and misfit are diagonal, without what records share."""
-        transforms, values, log_determinant = [], [], 0.0
-        for i, noise in enumerate(self.noise):
-            variances, vectors = eigh(self.misfit_covariance(i), noise.covariance)
-            transforms.append(vectors.T)
-            values.append(np.maximum(variances, 0.0))
-            log_determinant += float(np.linalg.slogdet(noise.covariance)[1])
-        record = np.repeat(np.arange(len(values)), [len(own) for own in values])
-        return Spectrum(tuple(transforms), np.concatenate(values), record, log_determinant)
 
-
-@dataclass(frozen=True)
 class Spectrum:
     """The N residuals of all records in coordinates in which noise has variance 1 and misfit is diagonal.
 
-    ``transforms`` (n, n) of each record lead there; ``values`` (N,) are the variances of the misfit and
-    ``record`` (N,) the numbers of the records; ``log_determinant`` is that of the noise's covariance.
+    What records share is left out. ``transforms`` (n, n) of each record lead there; ``values`` (N,) are the
+    variances of the misfit and ``record`` (N,) the numbers of the records; ``log_determinant`` is that of the
+    noise's covariance.
     """
 
-    transforms: tuple[Array, ...]
-    values: Array
-    record: Indices
-    log_determinant: float
+    def __init__(self, model: ResidualModel) -> None:
+        noises = [noise.covariance for noise in model.noise]
+        pairs = [eigh(model.misfit_covariance(i), noise) for i, noise in enumerate(noises)]
+        self.transforms = [vectors.T for _, vectors in pairs]
+        self.values = np.concatenate([np.maximum(variances, 0.0) for variances, _ in pairs])
+        self.record = np.repeat(np.arange(len(noises)), [len(noise) for noise in noises])
+        self.log_determinant = sum(float(np.linalg.slogdet(noise)[1]) for noise in noises)
 
     def transform(self, rows: Array) -> Array:
         """Transform residuals (N, ...) of all records, one after the other."""
@@ -244,7 +236,12 @@ def estimate_discrepancy(
     expected within a factor of four, unless the residuals say otherwise.
     """
     model = replace(model, misfit=np.ones(len(model.noise)), site_factor=1.0, site_factors=np.ones(1))
-    start = np.array([_guess_misfit(*own) for own in zip(residuals, model.noise, model.peaks_N, strict=True)])
+    excess = [
+        np.mean(residual**2) - np.trace(noise.covariance) / residual.size
+        for residual, noise in zip(residuals, model.noise, strict=True)
+    ]
+    guess = np.sqrt(np.maximum(excess, 0.0)) / model.peaks_N
+    start = np.log(np.clip(guess, 10 * _MIN_MISFIT, 0.5))
     bounds = [(np.log(_MIN_MISFIT), np.log(_MAX_MISFIT))] * len(start)
     if model.site_N:
         start, bounds = np.append(start, 0.0), [*bounds, tuple(np.log(_SITE_FACTOR_BOUNDS))]
@@ -321,11 +318,6 @@ def estimate_mesh_misfit(
     return MeshMisfitSummary(share=found.misfit_elsewhere, correlation=found.correlation)
 
 
-def _guess_misfit(residual: Array, noise: SiteNoise, peak: float) -> float:
-    excess = max(float(np.mean(residual**2) - np.trace(noise.covariance) / residual.size), 0.0)
-    return float(np.log(np.clip(np.sqrt(excess) / peak, 10 * _MIN_MISFIT, 0.5)))
-
-
 class _RestrictedLikelihood:
     """All records in coordinates in which the misfit of ``unit``, of the size of the largest forces, is
     diagonal.
@@ -337,7 +329,7 @@ class _RestrictedLikelihood:
     def __init__(
         self, residuals: Sequence[Array], jacobians: Sequence[Array], unit: ResidualModel, precision: Array
     ) -> None:
-        spectrum, shared = unit.whiten(), np.concatenate(unit.shared_deviations)
+        spectrum, shared = Spectrum(unit), np.concatenate(unit.shared_deviations)
         self.records, self.record, self.values = len(unit.noise), spectrum.record, spectrum.values
         self.residual = spectrum.transform(np.concatenate(residuals))
         self.jacobian = spectrum.transform(np.hstack([np.concatenate(jacobians), shared]))

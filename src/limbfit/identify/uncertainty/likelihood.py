@@ -29,7 +29,7 @@ from ..fit.objective import MeasuredCurve, SiteResponse
 from ..fit.parameters import SearchSpace, Unknowns
 from ..fit.prediction import MAX_FREEDOM
 from ..fit.trust_region import SearchPoint, minimise
-from .discrepancy import ResidualModel
+from .discrepancy import ResidualModel, Spectrum
 from .emulator import Emulator
 from .uncertainty import PriorPrecision
 
@@ -73,7 +73,7 @@ class Likelihood:
         self.emulator, self.measured, self.model = emulator, tuple(measured), model
         self.unknowns, self.space, self.counts_emulator = unknowns, space, counts_emulator
         self._prior = PriorPrecision.from_unknowns(unknowns, space)
-        self._spectrum = model.whiten()
+        self._spectrum = Spectrum(model)
         self._shared = self._spectrum.transform(np.concatenate(model.shared_deviations))
         self._target = self._spectrum.transform(np.concatenate([site.force_N for site in measured]))
 

@@ -124,14 +124,6 @@ def _convolve(elastic: Array, times_s: Array, taus: Array) -> Array:
     return found
 
 
-def _compute_elastic(relaxed: Array, times_s: Array, terms: RelaxationTerms) -> Array:
-    """Return the elastic columns (n, q) whose relaxation gives ``relaxed`` (n, q)."""
-    steps = np.eye(len(times_s))
-    histories = _convolve(steps, times_s, terms.times_s)
-    relaxation = terms.constant * steps + np.tensordot(terms.amplitudes, histories, 1)
-    return np.asarray(solve_triangular(relaxation, relaxed, lower=True))
-
-
 class Superposition:
     """Forces of a record for any relaxation, from its simulation at ``parameters`` (p,)."""
 
@@ -140,11 +132,13 @@ class Superposition:
     ) -> None:
         self.times_s, self.parameters, self.tissues = times_s, parameters, tissues
         self.in_contact = (response.force_N > 0)[:, None]
-        scaled = response.jacobian * parameters
-        self.elastic = [
-            _compute_elastic(scaled[:, [*one.moduli, *one.others]], times_s, one.own_terms(parameters))
-            for one in tissues
-        ]
+        scaled, steps = response.jacobian * parameters, np.eye(len(times_s))
+        self.elastic = []  # columns (n, q) of each tissue, whose relaxation gives what was simulated
+        for one in tissues:
+            terms, relaxed = one.own_terms(parameters), scaled[:, [*one.moduli, *one.others]]
+            histories = _convolve(steps, times_s, terms.times_s)
+            relaxation = terms.constant * steps + np.tensordot(terms.amplitudes, histories, 1)
+            self.elastic.append(np.asarray(solve_triangular(relaxation, relaxed, lower=True)))
 
     def respond(self, relaxation: RelaxationModel, p: Array) -> SiteResponse:
         """Force (n,) and derivatives (n, p) with a relaxation at parameters p, further terms among them."""

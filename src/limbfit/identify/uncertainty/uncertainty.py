@@ -106,10 +106,9 @@ class PriorPrecision:
         return np.where(moved, caused / variance, 0.0), np.sqrt(np.where(moved, without / variance, 1.0))
 
 
-@dataclass(frozen=True)
 class _LinearisedEstimate:
-    """Covariance about the calibrated z (k,), and the parts of it that records, misfit and sites that differ
-    cause.
+    """Covariance (k, k) about the calibrated z (k,), and the parts of it that records, misfit and sites that
+    differ cause.
 
     ``centre`` (k,) is where generalised least squares by noise and misfit would go, with covariance ``best``
     (k, k); the calibration has other weights. If the two are farther apart than noise and misfit explain, the
@@ -119,18 +118,8 @@ class _LinearisedEstimate:
     most probable parameters (Gauss and Markov).
     """
 
-    centre: Array
-    best: Array
-    covariance: Array
-    about_centre: Array
-    by_records: Array
-    by_misfit: Array
-    by_sites: Array
-    model: ResidualModel
-
-    @classmethod
-    def linearise(
-        cls,
+    def __init__(
+        self,
         z: Array,
         residuals: Sequence[Array],
         jacobians: Sequence[Array],
@@ -139,14 +128,14 @@ class _LinearisedEstimate:
         prior: PriorPrecision,
         model: ResidualModel,
         space: SearchSpace,
-    ) -> _LinearisedEstimate:
-        """Build the estimate at z (k,) from residuals (n,), derivatives (n, k) N and the curvature (n, n) of
+    ) -> None:
+        """Linearise at z (k,) from residuals (n,), derivatives (n, k) N and the curvature (n, n) of
         the cost per record; ``prior_share`` is the weight of the priors' squares in the cost.
         """
         precision, weighted = prior.weigh(jacobians, model)
-        best = np.asarray(np.linalg.inv(precision), dtype=np.float64)
+        self.model, self.best = model, np.asarray(np.linalg.inv(precision), dtype=np.float64)
         slope = prior.rows.T @ prior.compute_deviations(z) + sum(W.T @ r for r, W in zip(residuals, weighted))
-        centre = np.clip(z - best @ slope, space.lower, space.upper)
+        self.centre = np.clip(z - self.best @ slope, space.lower, space.upper)
         gradients = [J.T @ W for J, W in zip(jacobians, curvatures, strict=True)]
         G = np.hstack(gradients)
         M = G @ model.covariance @ G.T
@@ -155,22 +144,15 @@ class _LinearisedEstimate:
         # What the bounds say has no place in the estimator: it counts as beside records of the mean noise.
         spread = max(float(np.trace(M) / np.trace(H)), 1e-16 * float(np.trace(H)))
         inverse = np.linalg.inv((H + prior_share * of_priors) / spread + prior.bound_precision) / spread
-        by_records = inverse @ M @ inverse
+        self.by_records = inverse @ M @ inverse
         known_before = prior_share**2 * of_priors + spread**2 * prior.bound_precision
-        covariance = by_records + inverse @ known_before @ inverse
-        unexplained = _compute_unexplained(centre - z, covariance - best)
+        self.about_centre = self.by_records + inverse @ known_before @ inverse
+        unexplained = _compute_unexplained(self.centre - z, self.about_centre - self.best)
+        self.covariance = self.about_centre + unexplained
         of_misfit = sum(own @ model.misfit_covariance(i) @ own.T for i, own in enumerate(gradients))
+        self.by_misfit = inverse @ of_misfit @ inverse + unexplained
         of_sites = inverse @ G @ np.concatenate(model.site_deviations)
-        return cls(
-            centre=centre,
-            best=best,
-            covariance=covariance + unexplained,
-            about_centre=covariance,
-            by_records=by_records,
-            by_misfit=inverse @ of_misfit @ inverse + unexplained,
-            by_sites=of_sites @ of_sites.T,
-            model=model,
-        )
+        self.by_sites = of_sites @ of_sites.T
 
     def judge(self, rows: Array) -> tuple[Array, Array, Array]:
         """Return half the 95 % intervals of ``rows @ z``, rows (m, k), their standard deviations, and the
@@ -294,7 +276,7 @@ def estimate_uncertainty(
         one.compute_cost_curvature(settings.objective, r) for r, one in zip(residuals, measured, strict=True)
     ]
     share = (settings.force_error_percent / 100) ** 2
-    estimate = _LinearisedEstimate.linearise(z, residuals, scaled, curvatures, share, prior, model, space)
+    estimate = _LinearisedEstimate(z, residuals, scaled, curvatures, share, prior, model, space)
 
     tie, middle = space.tie, space.to_logarithms(z)
     half, sd, freedom = estimate.judge(tie)

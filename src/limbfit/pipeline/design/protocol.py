@@ -154,7 +154,7 @@ def run_protocol(
     of_parameters = np.eye(len(names))[[names.index(name) for name in determine]]
     rows = np.array(list(pressures.values())) if pressures else of_parameters
     tissues = sample_tissues(known, space, centre, draws, seed)
-    noises = RecordNoise.from_sds(NoiseModel(**noise), **seen)
+    noises = RecordNoise(NoiseModel(**noise), **seen)
     planned, left_out = _plan_records(context, speeds_mm_s, holds_s, depths_mm, noises)
     budget = Budget(60.0 * minutes, setup_s)
     _check_minutes([one.seconds + rest_s for one in planned], budget)

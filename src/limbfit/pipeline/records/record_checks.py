@@ -167,7 +167,7 @@ def check_records(
         failed.extend(f"site {a.site}, record of {b.site}: {a.reason}" for a, b in pairs if not a.completed)
         return one, two
 
-    found = find_outliers(
+    left_out, warnings = find_outliers(
         simulate,
         [replace(record.curve, weight=1.0 / record.record.of_site) for record in records],
         best,
@@ -176,10 +176,10 @@ def check_records(
         one,
         tie,
     )
-    against = explain_warnings(found.warnings, plain)
+    against = explain_warnings(warnings, plain)
     flags = [RecordFlag(**flag.to_dict(), found="in the record") for flag in plain]
     flags += [RecordFlag(**flag.to_dict(), found="against the model") for flag in against]
-    return {"flags": flags, "left_out": found.left_out, "failed": list(dict.fromkeys(failed))}
+    return {"flags": flags, "left_out": left_out, "failed": list(dict.fromkeys(failed))}
 
 
 def _build_driven_job(site: SiteRecord, other: SiteRecord, parameters: Array) -> SimulationJob:
