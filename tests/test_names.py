@@ -12,7 +12,7 @@ VERBS = frozenset(
     """
 acquire adapt add advance amputate announce append apply approach approximate assemble assess assign
 average balance batch begin bench bisect build bump calibrate call cap change check choose clamp
-classify clean clear clip close coarsen code collect combine compare compile compress compute
+classify clean clear close coarsen code collect combine compare compile compress compute
 connect constrain continue convert convolve copy correct count couple create cross curve cut decode
 deform delay demo derive describe design diagnose die dilate divide do draw drop edit embed equilibrate
 erode estimate evaluate expand explain explore export extend extract extrapolate extrude fail fill find

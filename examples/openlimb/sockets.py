@@ -14,7 +14,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from limbfit.anatomy.surfaces.bodies import name_bodies
+from limbfit.anatomy.surfaces.exchange import name_bodies
 from limbfit.anatomy.surfaces.files import read_surface, write_surface
 from limbfit.anatomy.surfaces.triangles import Surface, remove_unused_points
 

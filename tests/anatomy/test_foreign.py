@@ -12,7 +12,7 @@ from limbs import SHARED, rotation
 
 from limbfit.anatomy.meshing import improving, meshing
 from limbfit.anatomy.meshing.background import compute_volumes
-from limbfit.anatomy.meshing.engines import ENGINES, VolumeMesh, run_mmg
+from limbfit.anatomy.meshing.engines import ENGINES, VolumeMesh
 from limbfit.anatomy.meshing.extrusion import extrude_layers
 from limbfit.anatomy.meshing.improving import (
     find_constraints,
@@ -53,7 +53,7 @@ def site(anatomy):
 @pytest.fixture(scope="module")
 def core(anatomy, base, site) -> VolumeMesh:
     """What the mesher makes of the site, once for all tests."""
-    made = []
+    made, run_mmg = [], ENGINES["mmg"]
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(ENGINES, "mmg", lambda *task: made.append(run_mmg(*task)) or made[0])
         mesh_site(anatomy, *site, COARSE, base)

@@ -127,7 +127,7 @@ def test_no_marker_where_there_is_none() -> None:
 
 
 def marker_at(x: float, y: float = 0.0) -> Marker:
-    return Marker(np.array([x, y, 0.0]), 4.0, 60.0, np.array([0.0, 0.0, 1.0]))
+    return Marker(np.array([x, y, 0.0]), 4.0, np.array([0.0, 0.0, 1.0]))
 
 
 def test_matching_is_one_to_one_where_the_nearest_is_not() -> None:

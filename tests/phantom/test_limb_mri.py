@@ -15,8 +15,8 @@ from limbfit.phantom.mri import (
     BIAS,
     FULL_SCALE,
     MARKER_HEIGHT_MM,
-    NOISE,
     RESCALE_SLOPE,
+    UTE,
     ScanGrid,
     generate_slabs,
     make_grid,
@@ -69,7 +69,7 @@ def read(folder: Path) -> sitk.Image:
     return reader.Execute()
 
 
-def rendered(limb, grid, markers=(), seed=0, noise=NOISE) -> np.ndarray:
+def rendered(limb, grid, markers=(), seed=0, noise=UTE.noise) -> np.ndarray:
     return np.concatenate([signal for _, signal in generate_slabs(limb, grid, markers, seed, noise)])
 
 
@@ -161,12 +161,12 @@ def test_the_outline_has_partial_volume_at_the_truth(limb, clean, points) -> Non
 
 
 def test_noise_is_rician(limb, points, clean, noisy) -> None:
-    air = noisy[limb.skin(points) > 8] / NOISE
+    air = noisy[limb.skin(points) > 8] / UTE.noise
     assert air.mean() == pytest.approx(np.sqrt(np.pi / 2), rel=0.01)  # Rayleigh
     assert air.std() == pytest.approx(np.sqrt(2 - np.pi / 2), rel=0.01)
     deep = (limb.skin(points) < -8) & (limb.bones(points) > 6)
     residual = noisy[deep] - clean[deep]
-    assert residual.std() == pytest.approx(NOISE, rel=0.02)
+    assert residual.std() == pytest.approx(UTE.noise, rel=0.02)
 
 
 def test_markers_are_bright_bumps_on_the_skin_and_change_nothing_else(

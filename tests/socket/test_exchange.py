@@ -13,8 +13,7 @@ from socket_limbs import CUT_NORMAL, revolved, round_limb
 
 from limbfit import InputError, compare_shapes, convert_shape
 from limbfit.anatomy.grid import build_limb_frame
-from limbfit.anatomy.surfaces.bodies import read_body
-from limbfit.anatomy.surfaces.comparison import find_axis, list_circumferences, register_surface
+from limbfit.anatomy.surfaces.exchange import find_axis, list_circumferences, read_body, register_surface
 from limbfit.anatomy.surfaces.files import read_surface, write_surface
 from limbfit.anatomy.surfaces.slices import format_slices, read_slices
 from limbfit.anatomy.surfaces.triangles import Surface, stack_surfaces

@@ -16,11 +16,11 @@ from dataclasses import dataclass, field, replace
 from itertools import permutations
 from math import prod
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 import SimpleITK as sitk  # noqa: N813
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from ..arrays import Array, Mask
 from ..errors import ImageError, LabelError
@@ -54,14 +54,13 @@ class Grid:
     origin: Array
     direction: Array
 
+    _dtype: ClassVar[DTypeLike | None] = None  # that of the array; by default what is given
+
     def __post_init__(self) -> None:
         for name in ("spacing", "origin", "direction"):
             object.__setattr__(self, name, np.array(getattr(self, name), dtype=float))
-        object.__setattr__(self, "array", self._to_array(self.array))
+        object.__setattr__(self, "array", np.asarray(self.array, self._dtype))
         self._check()
-
-    def _to_array(self, array: ArrayLike) -> NDArray[Any]:
-        return np.asarray(array)
 
     def _check(self) -> None:
         if self.array.ndim != 3 or 0 in self.array.shape:
@@ -205,15 +204,14 @@ class Volume(Grid):
     modality: str = ""
     notes: tuple[str, ...] = ()
 
-    def _to_array(self, array: ArrayLike) -> NDArray[Any]:
-        return np.asarray(array, dtype=np.float32)
+    _dtype: ClassVar = np.float32
 
     @classmethod
     def from_sitk(cls, image: sitk.Image) -> Volume:
         return cls(sitk.GetArrayFromImage(image), *read_geometry(image))
 
-    def with_array(self, array: ArrayLike) -> Volume:
-        return replace(self, array=np.asarray(array))
+    def with_array(self, array: NDArray[Any]) -> Volume:
+        return replace(self, array=array)
 
 
 @dataclass(frozen=True)
@@ -233,14 +231,11 @@ class LabelMap(Grid):
         object.__setattr__(self, "names", names)
         if len(set(names.values())) < len(names):
             raise LabelError("two labels have the same name", remedy="give them different names")
-
-    def _to_array(self, array: ArrayLike) -> NDArray[Any]:
-        raw = np.asarray(array)
-        if raw.dtype == np.uint8:
-            return raw
-        if raw.size and (raw.min() < 0 or raw.max() > 255 or np.any(raw != np.round(raw))):
-            raise LabelError("labels must be whole numbers from 0 to 255")
-        return raw.astype(np.uint8)
+        raw = self.array
+        if raw.dtype != np.uint8:
+            if raw.min() < 0 or raw.max() > 255 or np.any(raw != np.round(raw)):
+                raise LabelError("labels must be whole numbers from 0 to 255")
+            object.__setattr__(self, "array", raw.astype(np.uint8))
 
     @property
     def limb(self) -> Mask:
@@ -275,12 +270,10 @@ class LabelMap(Grid):
 
     def value(self, name: str) -> int:
         """The label value of a name."""
-        for value, known in self.names.items():
-            if known == name:
-                return value
-        raise LabelError(
-            f"no label is named {name!r}", remedy="the map has " + ", ".join(sorted(self.names.values()))
-        )
+        values = {known: value for value, known in self.names.items()}
+        if name not in values:
+            raise LabelError(f"no label is named {name!r}", remedy="the map has " + ", ".join(sorted(values)))
+        return values[name]
 
     @property
     def soft_value(self) -> int:
@@ -294,8 +287,8 @@ class LabelMap(Grid):
         """Voxels of one name."""
         return self.array == self.value(name)
 
-    def with_array(self, array: ArrayLike, names: Mapping[int, str] | None = None) -> LabelMap:
-        return replace(self, array=np.asarray(array), names=dict(names or self.names))
+    def with_array(self, array: NDArray[Any], names: Mapping[int, str] | None = None) -> LabelMap:
+        return replace(self, array=array, names=dict(names or self.names))
 
 
 def check_voxel_count(size: Sequence[int], path: str | Path) -> None:
@@ -417,9 +410,4 @@ def find_proximal_end(
     if len(border) == 2:
         return max(border, key=lambda end: end.direction(grid)[2])
     depth = min(3, high - low)
-    return max(ends, key=lambda end: int(select_layer(limb, axis, end.layer - depth * end.side).sum()))
-
-
-def select_layer(mask: Mask, axis: int, index: int) -> Mask:
-    """One layer of ``[k, j, i]`` across grid axis 0, 1, 2 (i, j, k)."""
-    return np.take(mask, index, axis=2 - axis)
+    return max(ends, key=lambda end: int(limb.take(end.layer - depth * end.side, axis=2 - axis).sum()))

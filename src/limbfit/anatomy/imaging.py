@@ -4,6 +4,7 @@ Images: DICOM folders, NIfTI, NRRD, MetaImage.  Label maps: ``.seg.nrrd``, any l
 RTSTRUCT.
 """
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -101,4 +102,5 @@ def write_labels(path: str | Path, labels: LabelMap) -> None:
         return
     format_of(path, written=True)
     sitk.WriteImage(labels.to_sitk(), str(path), useCompression=True)
-    labelfiles.write_sidecar(path, labels.names)
+    names = json.dumps({str(value): name for value, name in sorted(labels.names.items())}, indent=2)
+    labelfiles.find_sidecar(path).write_text(names + "\n", encoding="utf-8")

@@ -70,12 +70,9 @@ def _make_room(mask: Mask, reach_mm: float, spacing: Array) -> tuple[Mask, Box, 
     """The mask in its box with room around it; its box there, and its box in the array."""
     reach = np.ceil(reach_mm / spacing[: mask.ndim]).astype(int)[::-1] + 1
     box = find_box(mask)
-    wide = find_box(mask, reach)
-    pads = [
-        (r - (b.start - w.start), r - (w.stop - b.stop)) for r, b, w in zip(reach, box, wide, strict=True)
-    ]
+    wide = tuple(slice(b.start, b.stop + 2 * r) for r, b in zip(reach, box, strict=True))
     inner = tuple(slice(r, r + b.stop - b.start) for r, b in zip(reach, box, strict=True))
-    return np.pad(mask[wide], pads, mode="edge"), inner, box
+    return np.pad(mask, reach[:, None], mode="edge")[wide], inner, box
 
 
 def find_box(mask: Mask, margin: Indices | int = 0) -> Box:
@@ -105,3 +102,11 @@ def find_largest_piece(mask: Mask) -> Mask:
     if count < 2:
         return mask
     return np.asarray(parts == int(np.argmax(np.bincount(parts[mask])[1:])) + 1)
+
+
+def fill_largest_piece(mask: Mask) -> Mask:
+    """The largest of the pieces of a mask, without holes."""
+    box = find_box(mask)
+    filled = np.zeros_like(mask)
+    filled[box] = binary_fill_holes(find_largest_piece(mask[box]))
+    return filled

@@ -98,11 +98,10 @@ class CasePart:
 
 @dataclass(frozen=True)
 class SocketCase:
-    """An input of the folder ``socket``: its name and its parts."""
+    """An input of the folder ``socket``, of hexahedra: its name and its parts."""
 
     name: str
     parts: tuple[CasePart, ...]
-    element: str = "hex8"
 
 
 SOCKET = (
@@ -220,7 +219,7 @@ def compare_socket(case: SocketCase, folder: Path) -> Iterator[dict[str, Any]]:
         for part in case.parts:
             name = f"{part.table or case.name}.txt"
             log, febio = read_log(Path(out) / name), read_log(file.with_name(name))
-            row = {"case": f"{case.name}: {part.name}", "element": case.element, "goal_percent": part.goal}
+            row = {"case": f"{case.name}: {part.name}", "element": "hex8", "goal_percent": part.goal}
             reason = "" if run.result.completed else run.result.reason
             yield row | _build_comparison_row(part, log, febio, reason)
 

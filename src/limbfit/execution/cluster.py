@@ -11,7 +11,6 @@ import time
 import uuid
 from collections.abc import Callable, Iterator
 from contextlib import suppress
-from dataclasses import dataclass
 from queue import Empty, SimpleQueue
 from typing import Any, Self
 
@@ -35,11 +34,10 @@ _POLL_S = 1.0  # between two looks at which workers there are
 _DEFAULT_MEMORY_GB = 4.0  # asked of the batch system for a worker where the study sets no limit
 
 
-@dataclass(frozen=True)
-class _LostJob:
+class _LostJob(str):
     """The reason why a job had no answer."""
 
-    reason: str
+    __slots__ = ()
 
 
 _local = threading.local()  # of a Dask worker: the process that does the jobs of each of its threads
@@ -178,7 +176,7 @@ class DaskExecutor(Executor):
                             batch.on_report(batch.jobs[report[0]], report[1])
                 answer = self._result(futures.pop(i), contained)
                 if isinstance(answer, _LostJob) and batch.on_lost is not None:
-                    answer = batch.on_lost(job, answer.reason)
+                    answer = batch.on_lost(job, str(answer))
                 yield answer
         finally:
             with suppress(Exception):  # the scheduler may be gone

@@ -62,11 +62,6 @@ def report_progress(message: Any) -> None:
         listener(message)
 
 
-def send_reports_to(listener: Callable[[Any], None] | None) -> AbstractContextManager[None]:
-    """Send what `report_progress` is given in this block to ``listener``."""
-    return set_in_block(_listener, listener)
-
-
 @contextmanager
 def set_in_block(variable: ContextVar[Setting], value: Setting) -> Iterator[None]:
     """Give a variable another value in this block."""
@@ -165,7 +160,8 @@ class SerialExecutor(Executor):
 
     def _run_jobs(self, batch: Batch) -> Iterator[Any]:
         def do_job(job: Any) -> Any:
-            with send_reports_to(None if batch.on_report is None else partial(batch.on_report, job)):
+            report = None if batch.on_report is None else partial(batch.on_report, job)
+            with set_in_block(_listener, report):
                 return batch.function(job)
 
         return map(do_job, batch.jobs)
@@ -412,7 +408,7 @@ def serve_jobs(connection: Connection) -> None:
         connection.send(READY)
     while True:
         try:
-            with send_reports_to(lambda message: connection.send(JobReport(message))):
+            with set_in_block(_listener, lambda message: connection.send(JobReport(message))):
                 outcome = _run_job(*connection.recv())
         except (EOFError, ConnectionError):
             return

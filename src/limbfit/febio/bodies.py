@@ -29,21 +29,12 @@ MIN_EDGE_ROUNDING = 0.05  # edge radius over the width that FEBio's contact goes
 QUADRATURE = {"tet4": "", "tet10": "TET10G4", "tet10p0": "TET10G4", "tet10g8": "TET10G8", "hex8": ""}
 
 
-@dataclass(frozen=True)
-class WrittenCurve:
-    """A load curve: ``points (n, 2)``, time in s and value."""
-
-    name: str
-    interpolate: str
-    points: Array
-
-
-class CurveList(list[WrittenCurve]):
-    """The load curves of a file; `add` gives a curve its number."""
+class CurveList(list[dict[str, Any]]):
+    """The load curves of a file, for the template; `add` gives a curve its number."""
 
     def add(self, name: str, points: Array, interpolate: str = "LINEAR") -> int:
         """Add points (n, 2), time in s and value; return the number of the curve."""
-        self.append(WrittenCurve(name, interpolate, points))
+        self.append({"name": name, "points": points, "interpolate": interpolate})
         return len(self)
 
 
@@ -293,12 +284,6 @@ def list_parts(problem: Problem, rigid: Mapping[str, RigidMesh]) -> Iterator[dic
     for name, cell_type, cells in parts:
         yield {"name": name, "cell_type": cell_type, "cells": cells, "first": first}
         first += len(cells)
-
-
-def name_node_sets(problem: Problem) -> dict[str, Indices]:
-    """Return the sets of nodes of a file by their names there."""
-    supports = {f"support_{i}": support.nodes for i, support in enumerate(problem.supports, 1)}
-    return {FIXED_SET: problem.fixed, **problem.mesh.node_sets, **supports}
 
 
 def name_surfaces(problem: Problem, bodies: Sequence[FebBody]) -> dict[str, Indices]:

@@ -137,7 +137,11 @@ def compute_automatic_penalties(problem: Problem, faces: Indices, dt: float) -> 
     behind = find_cells_behind(mesh, faces)
     moduli = np.array([_compute_moduli(problem.materials[name], dt) for name in mesh.region_names])
     mu, kappa = moduli[mesh.regions[behind]].T
-    squared = _compute_normals(mesh.points, faces) ** 2
+    # Normals of faces with three corners, or across the diagonals of four.
+    (a, b), (c, d) = ((0, 2), (1, 3)) if faces.shape[1] == 4 else ((0, 1), (0, 2))
+    corners = mesh.points[faces]
+    normals = np.cross(corners[:, b] - corners[:, a], corners[:, d] - corners[:, c])
+    squared = (normals / np.linalg.norm(normals, axis=1, keepdims=True)) ** 2
     between = 0.5 * (1.0 - (squared**2).sum(axis=1))  # n1^2 n2^2 + .., as the squares add up to one
     compliance = (3.0 * kappa + mu) / (9.0 * kappa * mu) + 3.0 * between / mu
     _, weights = compute_reference_gradients(problem.formulation, mesh.points, mesh.cells[behind])
@@ -163,13 +167,6 @@ def _compute_mean_modulus(problem: Problem) -> float:
 def _compute_areas(problem: Problem, faces: Indices, points: Array) -> Array:
     """Return the areas (f, q) of the quadrature points of faces (f, k), mm^2."""
     return build_face_quadrature(problem.formulation, points, faces, problem.contact_rule)[1]
-
-
-def _compute_normals(points: Array, faces: Indices) -> Array:
-    """Return unit normals (f, 3) of faces with three corners, or across the diagonals of four."""
-    (a, b), (c, d) = ((0, 2), (1, 3)) if faces.shape[1] == 4 else ((0, 1), (0, 2))
-    across = np.cross(points[faces[:, b]] - points[faces[:, a]], points[faces[:, d]] - points[faces[:, c]])
-    return np.asarray(across / np.linalg.norm(across, axis=1, keepdims=True))
 
 
 def _find_covered_faces(problem: Problem) -> Indices:

@@ -51,12 +51,13 @@ def to_problem(model: FebModel, indenter: Indenter | None = None, **settings: An
     faces, placed = np.zeros((0, 3), np.int64), None
     if touching:
         faces = find_touched_faces(model, next(iter(touching.values())), tissue)
-    if driven.axis is not None:
-        placed = (
-            build_indenter(model, driven.axis, name, find_smallest_depth(tissue.mesh, faces))
-            if indenter is None
-            else _place_indenter(model, driven.axis, name, indenter)
-        )
+    if indenter is None and driven.axis is not None:
+        placed = build_indenter(model, driven.axis, name, find_smallest_depth(tissue.mesh, faces))
+    elif indenter is not None and driven.axis is not None:
+        centre = model.rigid[name].centre
+        nodes = np.concatenate(find_boundary_faces(model.geometry.select_parts([name]).values()))
+        foremost = float(((model.geometry.points[nodes] - centre) @ driven.axis).max())
+        placed = replace(indenter, centre=centre + foremost * driven.axis, axis=driven.axis)
     elif indenter is not None and touching:
         raise ProblemError("no single rigid body goes straight into the tissue, to stand for an indenter")
     fixed, supports = _build_supports(model, tissue.node_index, driven)
@@ -131,14 +132,6 @@ def _choose_contact_rule(model: FebModel, tissue: TissueMesh) -> str:
     return "gauss7" if tissue.mesh.cell_type == "tet10" else "gauss"  # FEBio's quadrature
 
 
-def _place_indenter(model: FebModel, axis: Array, name: str, indenter: Indenter) -> Indenter:
-    """Put an indenter where the foremost point of a rigid body is."""
-    centre = model.rigid[name].centre
-    nodes = np.concatenate(find_boundary_faces(model.geometry.select_parts([name]).values()))
-    foremost = float(((model.geometry.points[nodes] - centre) @ axis).max())
-    return replace(indenter, centre=centre + foremost * axis, axis=axis)
-
-
 def _build_pressures(model: FebModel, tissue: TissueMesh) -> tuple[Pressure, ...]:
     """Return the pressures on tissue, over the whole time."""
     found = []
@@ -170,22 +163,17 @@ def _build_supports(model: FebModel, number: Indices, driven: Drive) -> tuple[In
     ]
     for name, carried in model.carried_nodes.items():
         way = driven.travel[name]
-        _check_agreement(model, driven, name)
+        for m, factor in zip(model.motions, driven.factors):
+            both = np.isin(m.nodes, carried)
+            if both.any() and not np.isclose(factor, way[m.component]):
+                node = model.geometry.node_ids[m.nodes[both][0]]
+                what = f"node {node} of {m.target!r} moves with the rigid body {name!r}, which goes elsewhere"
+                raise ProblemError(what, place=f"line {m.line}")
         if way.any():
             supports += [Support(number[carried], i, float(way[i])) for i in range(3)]
         else:
             nodes.append(number[carried])
     return np.unique(np.concatenate(nodes)) if nodes else np.zeros(0, np.int64), tuple(supports)
-
-
-def _check_agreement(model: FebModel, driven: Drive, name: str) -> None:
-    """Refuse conditions on nodes that a rigid body carries elsewhere."""
-    for m, factor in zip(model.motions, driven.factors):
-        both = np.isin(m.nodes, model.carried_nodes[name])
-        if both.any() and not np.isclose(factor, driven.travel[name][m.component]):
-            node = model.geometry.node_ids[m.nodes[both][0]]
-            what = f"node {node} of {m.target!r} moves with the rigid body {name!r}, which goes elsewhere"
-            raise ProblemError(what, place=f"line {m.line}")
 
 
 def build_step_control(model: FebModel, problem: Problem, **settings: Any) -> StepControl:

@@ -70,7 +70,7 @@ def run_feb(
     last = control.times[-1]
 
     def accept_step(step: Step) -> None:
-        tables.add(step)
+        tables.write(step)
         if weights is not None:
             weights.update_after(step)
         if on_step is not None:
@@ -113,19 +113,16 @@ class LogTables:
     def __enter__(self) -> LogTables:
         for path in self.files:
             self.streams[path] = path.open("w", encoding="utf-8")
-        self._write(0.0, None)
+        self.write(None)
         return self
 
     def __exit__(self, *_: object) -> None:
         for stream in self.streams.values():
             stream.close()
 
-    def add(self, step: Step) -> None:
-        """Write one accepted step."""
-        self._write(self.model.settling_time_s + step.time, step)
-
-    def _write(self, time: float, step: Step | None) -> None:
-        fields = None
+    def write(self, step: Step | None) -> None:
+        """Write one accepted step; None: the beginning."""
+        time, fields = 0.0 if step is None else self.model.settling_time_s + step.time, None
         if step is not None and any(request.kind == "element_data" for request in self.model.requests):
             fields = compute_element_fields(self.system, self.laws, step.state)
         u = self._compute_displacement(step)

@@ -43,7 +43,6 @@ from .bodies import (
     has_round_edges,
     list_conditions,
     list_parts,
-    name_node_sets,
     name_surfaces,
 )
 from .penalty import compute_explicit_penalty, compute_mean_stiffness
@@ -209,7 +208,12 @@ def _describe_file(
     curves, settled = CurveList(), Preparation.from_problem(problem).settling_s
     ends = find_step_ends([body.motion for body in bodies], float(prepared.history.times[-1]), settled)
     rigid = [list_conditions(body.name, body.motion, ends, curves) for body in bodies]
-    steps = list(_describe_steps(problem, ends, settled, rigid))
+    steps: list[dict[str, Any]] = []
+    for k, (begin, end) in enumerate(pairwise([0.0, *ends])):
+        largest = PRESTRAIN_S / 10.0 if end <= settled else _compute_largest_step(problem)
+        size = _divide_evenly(end - begin, 0.25 * largest)  # of the first steps, s, which FEBio enlarges
+        own = [one for body in rigid for one in body[k]]
+        steps.append({"count": round((end - begin) / size), "size": size, "conditions": own})
     meshes = {body.name: body.tool for body in bodies}
     centres = {body.name: body.centre for body in bodies}
     everywhere = steps[0]["conditions"] if len(steps) == 1 else []
@@ -219,6 +223,8 @@ def _describe_file(
         everywhere = [*everywhere, *list_conditions(FRAME_BODY, REST, ends[-1:], curves)[0]]
     remarks = (f"limbfit: {settings.title}; mm, N, s, MPa", *describe_differences(problem, settings))
     history, prestrains = prepared.history, _find_prestrains(problem)
+    supports = {f"support_{i}": support.nodes for i, support in enumerate(problem.supports, 1)}
+    fibres = {} if problem.fibres is None else _divide_by_region(problem.mesh, problem.fibres, (3,))
     return {
         "problem": problem,
         "bodies": bodies,
@@ -231,10 +237,13 @@ def _describe_file(
         "is_symmetric": not problem.pressures and not any(body.has_friction for body in bodies),
         "points": np.vstack([problem.mesh.points, *(mesh.points for mesh in meshes.values())]),
         "parts": list(list_parts(problem, meshes)),
-        "node_sets": name_node_sets(problem),
+        "node_sets": {FIXED_SET: problem.fixed, **problem.mesh.node_sets, **supports},
         "surfaces": name_surfaces(problem, bodies),
         "quadrature": QUADRATURE[problem.formulation.name],
-        "fibre_maps": _find_fibre_directions(problem),
+        # FEBio takes axes of a material in some kinds of materials only, those of elements in all.
+        "fibre_maps": {
+            name: own for name, own in fibres.items() if problem.materials[name].table().has_fibres
+        },
         "prestrain_maps": {name: own for name, own in prestrains.items() if len(own) > 1},
         "prestrain_names": {name: re.sub(r"\W", "_", f"prestrain of {name}") for name in prestrains},
         "fixed_set": FIXED_SET,
@@ -255,17 +264,6 @@ def _describe_file(
         "gradient": GRADIENT,
         "curves": curves,
     }
-
-
-def _describe_steps(
-    problem: Problem, ends: list[float], settled: float, rigid: list[list[list[dict[str, Any]]]]
-) -> Iterator[dict[str, Any]]:
-    """Describe the steps of the analysis; ``rigid`` are the conditions of each body in every step."""
-    for k, (begin, end) in enumerate(pairwise([0.0, *ends])):
-        largest = PRESTRAIN_S / 10.0 if end <= settled else _compute_largest_step(problem)
-        size = _divide_evenly(end - begin, 0.25 * largest)  # of the first steps, s, which FEBio enlarges
-        conditions = [one for body in rigid for one in body[k]]
-        yield {"count": round((end - begin) / size), "size": size, "conditions": conditions}
 
 
 def _find_must_points(problem: Problem, settings: FebSettings) -> Array:
@@ -345,15 +343,6 @@ def _divide_by_region(mesh: Mesh, values: Any, shape: tuple[int, ...]) -> dict[s
     """Return values of cells (or the one of all), of a ``shape``, by region."""
     given = np.broadcast_to(np.asarray(values, dtype=float), (len(mesh.cells), *shape))
     return {name: given[mesh.regions == r] for r, name in enumerate(mesh.region_names)}
-
-
-def _find_fibre_directions(problem: Problem) -> dict[str, Array]:
-    """Return the fibre direction in each cell (m, 3) of the regions that have some.
-
-    FEBio takes axes of a material in some kinds of materials only, those of elements in all.
-    """
-    found = {} if problem.fibres is None else _divide_by_region(problem.mesh, problem.fibres, (3,))
-    return {name: own for name, own in found.items() if problem.materials[name].table().has_fibres}
 
 
 def format_row(values: Iterable[float]) -> str:

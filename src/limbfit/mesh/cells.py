@@ -64,28 +64,19 @@ class CellType:
         return self.corners == 4
 
 
-def _compute_simplex_gradients(d: int) -> Array:
-    return np.vstack([-np.ones(d), np.eye(d)])
-
-
-def _to_barycentric(x: Array) -> Array:
-    return np.column_stack([1.0 - x.sum(axis=1), x])
-
-
 def linear_simplex(x: Array) -> tuple[Array, Array]:
     """Linear triangle (d = 2) or tetrahedron (d = 3)."""
-    L = _to_barycentric(x)
-    return L, np.broadcast_to(_compute_simplex_gradients(x.shape[1]), (*L.shape, x.shape[1])).copy()
+    gradients = np.vstack([-np.ones(x.shape[1]), np.eye(x.shape[1])])
+    return np.column_stack([1.0 - x.sum(axis=1), x]), np.tile(gradients, (len(x), 1, 1))
 
 
 def quadratic_simplex(x: Array) -> tuple[Array, Array]:
     """Quadratic triangle (6 nodes) or tetrahedron (10 nodes)."""
-    L, dL = _to_barycentric(x), _compute_simplex_gradients(x.shape[1])
-    edges = TRI6_EDGES if x.shape[1] == 2 else TET10_EDGES
-    i, j = edges[:, 0], edges[:, 1]
+    L, dL = linear_simplex(x)
+    i, j = (TRI6_EDGES if x.shape[1] == 2 else TET10_EDGES).T
     values = np.hstack([L * (2.0 * L - 1.0), 4.0 * L[:, i] * L[:, j]])
-    corner = (4.0 * L - 1.0)[:, :, None] * dL[None]
-    middle = 4.0 * (L[:, i, None] * dL[j][None] + L[:, j, None] * dL[i][None])
+    corner = (4.0 * L - 1.0)[:, :, None] * dL
+    middle = 4.0 * (L[:, i, None] * dL[:, j] + L[:, j, None] * dL[:, i])
     return values, np.concatenate([corner, middle], axis=1)
 
 

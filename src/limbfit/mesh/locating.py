@@ -40,7 +40,7 @@ def locate(mesh: Mesh, points: Array, region: int) -> tuple[Indices, Array, Arra
     found = []
     for point in points:
         near = candidates[np.argsort(np.linalg.norm(middles - point, axis=1))[:MAX_CANDIDATES]]
-        inside = _clip_into_cell(mesh, _find_local_coordinates(mesh, near, point))
+        inside = _find_local_coordinates(mesh, near, point)
         values, _ = mesh.kind.shape(inside)
         away = np.linalg.norm(np.einsum("mk,mki->mi", values, mesh.points[mesh.cells[near]]) - point, axis=1)
         best = int(np.argmin(away))
@@ -50,7 +50,7 @@ def locate(mesh: Mesh, points: Array, region: int) -> tuple[Indices, Array, Arra
 
 
 def _find_local_coordinates(mesh: Mesh, cells: Indices, point: Array) -> Array:
-    """Local coordinates (m, 3) of a point in each of the cells (m,), inside or not."""
+    """Local coordinates (m, 3) of a point in each of the cells (m,), moved into the cell."""
     corners = mesh.points[mesh.cells[cells]]
     middle = mesh.kind.nodes[: mesh.kind.corners].mean(axis=0)
     x = np.tile(middle, (len(cells), 1))
@@ -59,14 +59,9 @@ def _find_local_coordinates(mesh: Mesh, cells: Indices, point: Array) -> Array:
         missed = point - np.einsum("mk,mki->mi", values, corners)
         x = x + np.linalg.solve(np.einsum("mki,mkj->mij", corners, slopes), missed[..., None])[..., 0]
         x = np.clip(x, -_MAX_LOCAL, _MAX_LOCAL)
-    return x
-
-
-def _clip_into_cell(mesh: Mesh, local: Array) -> Array:
-    """Local coordinates (m, 3), moved into the cell."""
     if not mesh.kind.is_tetrahedron:
-        return np.asarray(np.clip(local, -1.0, 1.0))
-    shares = np.column_stack([1.0 - local.sum(axis=1), local]).clip(0.0)
+        return np.asarray(np.clip(x, -1.0, 1.0))
+    shares = np.column_stack([1.0 - x.sum(axis=1), x]).clip(0.0)
     return np.asarray((shares / shares.sum(axis=1, keepdims=True))[:, 1:])
 
 
@@ -160,11 +155,10 @@ def _find_crossings(mesh: Mesh, origin: Array, axis: Array) -> list[_Crossing]:
     crossings.sort(key=lambda c: c.along_mm)
     distinct: list[_Crossing] = []
     for crossing in crossings:
-        previous = distinct[-1] if distinct else None
         if (
-            previous is None
-            or crossing.along_mm - previous.along_mm >= _SAME_MM
-            or crossing.below != previous.below
+            not distinct
+            or crossing.along_mm - distinct[-1].along_mm >= _SAME_MM
+            or crossing.below != distinct[-1].below
         ):
             distinct.append(crossing)
     return distinct

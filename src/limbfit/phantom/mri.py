@@ -26,9 +26,7 @@ from ..anatomy.imaging import LabelMap
 from ..arrays import Array
 from .geometry import PROXIMAL_CUT_MM, Floats, Limb, build_rotation, intersect_fields
 
-FAT, MUSCLE, MARROW, CORTEX, TENDON, MARKER = 1.0, 0.5, 0.8, 0.12, 0.3, 1.15
 MARKER_DIAMETER_MM, MARKER_HEIGHT_MM = 9.0, 5.0
-NOISE = MUSCLE / 27.0
 BIAS = 0.2
 FULL_SCALE, RESCALE_SLOPE = 1200.0, 0.5
 SLAB = 12
@@ -58,7 +56,7 @@ class Contrast:
 
 
 CONTRASTS = {
-    "UTE": Contrast(0.0, FAT, MUSCLE, MARROW, CORTEX, TENDON, MARKER, NOISE, BIAS),
+    "UTE": Contrast(0.0, 1.0, 0.5, 0.8, 0.12, 0.3, 1.15, 0.5 / 27.0, BIAS),
     "T1": Contrast(0.0, 1.0, 0.35, 0.95, 0.03, 0.1, 1.15, 0.02, BIAS),
     "CT": Contrast(-1000.0, -100.0, 50.0, 60.0, 1300.0, 90.0, 400.0, 25.0, 0.0, rician=False),
 }
@@ -138,25 +136,6 @@ def _compute_tissue(
     return signal, skin
 
 
-def _add_marker(
-    signal: Floats,
-    skin: Floats,
-    points: Floats,
-    spacing: tuple[float, float, float],
-    marker: SkinMarker,
-    levels: Contrast,
-) -> None:
-    """Add a marker's signal in place, in the small box of voxels around it."""
-    near = np.linalg.norm(points - marker.position.astype(points.dtype), axis=-1) < 14.0
-    if not near.any():
-        return
-    box = tuple(slice(max(ix.min() - 1, 0), ix.max() + 2) for ix in np.nonzero(near))
-    if min(signal[box].shape) < 2:
-        return
-    (share,) = _compute_occupancy(marker.field(points[box]), spacing, (0.0,))
-    signal[box] += (levels.marker - levels.air) * share * (1 - skin[box])
-
-
 def _find_limb_window(grid: ScanGrid, limb: Limb, k: slice) -> tuple[slice, slice]:
     """Find the rows and columns of a slab that can hold tissue."""
     heights = np.array([-10.0, PROXIMAL_CUT_MM + 40.0])
@@ -201,7 +180,13 @@ def generate_slabs(
         points = grid.points(padded, rows, columns)
         tissue, skin = _compute_tissue(limb, points, grid.spacing, levels)
         for marker in markers:
-            _add_marker(tissue, skin, points, grid.spacing, marker, levels)
+            near = np.linalg.norm(points - marker.position.astype(points.dtype), axis=-1) < 14.0
+            if not near.any():
+                continue
+            box = tuple(slice(max(ix.min() - 1, 0), ix.max() + 2) for ix in np.nonzero(near))
+            if min(tissue[box].shape) > 1:
+                (share,) = _compute_occupancy(marker.field(points[box]), grid.spacing, (0.0,))
+                tissue[box] += (levels.marker - levels.air) * share * (1 - skin[box])
         signal = np.full((k.stop - k.start, *grid.shape[1:]), levels.air, np.float32)
         signal[:, rows, columns] = tissue[1:-1]
         signal *= _compute_bias(grid, k, seed, levels.bias)
@@ -248,26 +233,12 @@ def _format_decimals(values: Sequence[float] | Array) -> list[str]:
 def _build_slice(
     grid: ScanGrid, index: int, pixels: NDArray[np.uint16], seed: int, number: int, series: UID
 ) -> FileDataset:
+    """Build one slice of a made-up scan; nobody is behind its tags."""
     meta = FileMetaDataset()
     meta.MediaStorageSOPClassUID = MRImageStorage
     meta.MediaStorageSOPInstanceUID = _build_uid(seed, "image", number, index)
     meta.TransferSyntaxUID = ExplicitVRLittleEndian
     data = FileDataset(None, {}, file_meta=meta, preamble=b"\0" * 128)  # type: ignore[arg-type]
-    _write_identity_tags(data, meta, seed, number, series)
-    _write_geometry_tags(data, grid, index)
-    data.InstanceNumber = index + 1
-    data.SamplesPerPixel, data.PhotometricInterpretation = 1, "MONOCHROME2"
-    data.Rows, data.Columns = pixels.shape
-    data.BitsAllocated, data.BitsStored, data.HighBit, data.PixelRepresentation = 16, 16, 15, 0
-    data.RescaleSlope, data.RescaleIntercept, data.RescaleType = str(RESCALE_SLOPE), "0", "US"
-    data.PixelData = pixels.tobytes()
-    return data
-
-
-def _write_identity_tags(
-    data: FileDataset, meta: FileMetaDataset, seed: int, number: int, series: UID
-) -> None:
-    """Write the tags of a made-up scan; nobody is behind them."""
     data.SOPClassUID, data.SOPInstanceUID = meta.MediaStorageSOPClassUID, meta.MediaStorageSOPInstanceUID
     data.StudyInstanceUID, data.SeriesInstanceUID = _build_uid(seed, "study"), series
     data.FrameOfReferenceUID, data.PositionReferenceIndicator = _build_uid(seed, "frame"), ""
@@ -282,18 +253,19 @@ def _write_identity_tags(
     data.ScanningSequence, data.SequenceVariant, data.ScanOptions = "RM", "SP", ""
     data.MRAcquisitionType, data.RepetitionTime, data.EchoTime = "3D", "5.8", "0.1"
     data.MagneticFieldStrength, data.FlipAngle, data.EchoTrainLength = "3", "10", "1"
-
-
-def _write_geometry_tags(data: FileDataset, grid: ScanGrid, index: int) -> None:
-    """Write image plane tags: the row cosines point along i, the column cosines along j."""
     position = grid.origin + index * grid.spacing[2] * grid.direction[:, 2]
     data.ImagePositionPatient = _format_decimals(position)
-    data.ImageOrientationPatient = _format_decimals(
-        np.concatenate([grid.direction[:, 0], grid.direction[:, 1]])
-    )
+    data.ImageOrientationPatient = _format_decimals(grid.direction[:, :2].T.ravel())  # along i, along j
     data.PixelSpacing = _format_decimals([grid.spacing[1], grid.spacing[0]])
     data.SliceThickness = data.SpacingBetweenSlices = _format_decimals([grid.spacing[2]])[0]
     data.SliceLocation = _format_decimals([float(position @ grid.direction[:, 2])])[0]
+    data.InstanceNumber = index + 1
+    data.SamplesPerPixel, data.PhotometricInterpretation = 1, "MONOCHROME2"
+    data.Rows, data.Columns = pixels.shape
+    data.BitsAllocated, data.BitsStored, data.HighBit, data.PixelRepresentation = 16, 16, 15, 0
+    data.RescaleSlope, data.RescaleIntercept, data.RescaleType = str(RESCALE_SLOPE), "0", "US"
+    data.PixelData = pixels.tobytes()
+    return data
 
 
 def build_true_labels(limb: Limb, grid: ScanGrid) -> LabelMap:

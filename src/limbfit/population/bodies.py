@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..anatomy.surfaces.bodies import name_bodies
+from ..anatomy.surfaces.exchange import name_bodies
 from ..anatomy.surfaces.extraction import remesh
 from ..anatomy.surfaces.files import SUFFIXES, read_surface
 from ..anatomy.surfaces.triangles import Surface, stack_surfaces

@@ -138,30 +138,24 @@ def to_volume_shape(mesh: Mesh) -> VolumeShape:
         raise ProblemError("only meshes of tetrahedra are drawn, not of hexahedra")
     nodes, cells = np.unique(mesh.cells[:, :4], return_inverse=True)
     cells = cells.reshape(-1, 4)
-    faces, owners, neighbours = _build_face_table(cells, len(nodes))
-    return VolumeShape(
-        points=mesh.points[nodes].astype(np.float32),
-        cells=cells.astype(np.uint32),
-        regions=mesh.regions.astype(np.uint8),
-        nodes=nodes,
-        faces=faces.astype(np.uint32),
-        owners=owners.astype(np.uint32),
-        neighbours=neighbours.astype(np.int32),
-    )
-
-
-def _build_face_table(cells: NDArray[np.int64], count: int) -> tuple[NDArray[np.int64], ...]:
     faces = cells[:, TET_FACES].reshape(-1, 3)
     low, middle, high = np.sort(faces, axis=1).T
-    keys = (low * count + middle) * count + high
+    keys = (low * len(nodes) + middle) * len(nodes) + high
     order = np.argsort(keys, kind="stable")
     starts = np.flatnonzero(np.r_[True, np.diff(keys[order]) != 0])
     sizes = np.diff(np.r_[starts, len(order)])
     if sizes.max() > 2:
         raise ProblemError("a face of the mesh belongs to more than two cells")
-    owners = order[starts] // 4
     second = order[np.minimum(starts + 1, len(order) - 1)] // 4
-    return faces[order[starts]], owners, np.where(sizes == 2, second, _NO_CELL)
+    return VolumeShape(
+        points=mesh.points[nodes].astype(np.float32),
+        cells=cells.astype(np.uint32),
+        regions=mesh.regions.astype(np.uint8),
+        nodes=nodes,
+        faces=faces[order[starts]].astype(np.uint32),
+        owners=(order[starts] // 4).astype(np.uint32),
+        neighbours=np.where(sizes == 2, second, _NO_CELL).astype(np.int32),
+    )
 
 
 def extract_interface(volume: VolumeShape, region: int) -> Shell:

@@ -11,7 +11,6 @@ import sys
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -35,25 +34,14 @@ _AXIS_TOLERANCE = 1e-4
 _FINEST_MM = 0.02
 
 
-@dataclass(frozen=True)
-class Series:
-    """Images that belong together, in the order in which they were found."""
-
-    uid: str
-    slices: tuple[SliceHeader, ...]
-
-    @property
-    def summary(self) -> str:
-        first = self.slices[0]
-        number = f"series {first.series_number}, " if first.series_number.isdecimal() else ""
-        return f"{number}{len(self.slices)} x {first.rows} x {first.columns}, UID {self.uid}"
+Series = list[SliceHeader]  # images that belong together, in the order in which they were found
 
 
 def list_series(folder: str | Path) -> list[Series]:
     """The image series in a folder and those below it, ordered by UID; other files are passed over. Raises
     `ImageError` for a folder without images, or a damaged file in it.
     """
-    groups: dict[str, list[SliceHeader]] = defaultdict(list)
+    groups: dict[str, Series] = defaultdict(list)
     files = list_files(Path(folder))
     for number, path in enumerate(files, 1):
         place = f"file {number} of {len(files)} by name{_redact_name(path.relative_to(folder))}"
@@ -65,10 +53,8 @@ def list_series(folder: str | Path) -> list[Series]:
         raise ImageError(
             "no DICOM images in this folder", file=folder, remedy="give the folder that holds the slices"
         )
-    series = [Series(uid, tuple(slices)) for uid, slices in sorted(groups.items())]
-    if _is_one_stack(series):
-        return [Series(series[0].uid, tuple(single.slices[0] for single in series))]
-    return series
+    series = [groups[uid] for uid in sorted(groups)]
+    return [[single[0] for single in series]] if _is_one_stack(series) else series
 
 
 def _redact_name(path: Path) -> str:
@@ -97,17 +83,17 @@ def describe_series(folder: str | Path) -> list[dict[str, Any]]:
         raise ImageError("no such folder", file=folder, remedy="give the folder that holds the DICOM files")
     found = []
     for series in list_series(folder):
-        first, spacing_mm, why_not = series.slices[0], None, None
+        first, spacing_mm, why_not = series[0], None, None
         try:
-            spacing_mm = [round(float(step), 6) for step in stack_slices(series.slices)[1]]
+            spacing_mm = [round(float(step), 6) for step in stack_slices(series)[1]]
         except ImageError as error:
             why_not = str(error)
         found.append(
             {
-                "uid": series.uid,
+                "uid": first.series_uid,
                 "number": first.series_number if first.series_number.isdecimal() else "",
                 "modality": _redact_modality(first.modality),
-                "slices": len(series.slices),
+                "slices": len(series),
                 "rows": first.rows,
                 "columns": first.columns,
                 "spacing_mm": spacing_mm,
@@ -126,7 +112,7 @@ def read_series(folder: str | Path, series_uid: str | None = None) -> Volume:
     """
     series = _choose_series(Path(folder), list_series(folder), series_uid)
     with add_location(file=folder):
-        slices, spacing, direction = stack_slices(series.slices)
+        slices, spacing, direction = stack_slices(series)
         first = slices[0]
         assert first.position is not None
         check_voxel_count((first.columns, first.rows, len(slices)), folder)
@@ -135,15 +121,15 @@ def read_series(folder: str | Path, series_uid: str | None = None) -> Volume:
 
 def _choose_series(folder: Path, series_list: list[Series], uid: str | None) -> Series:
     if uid is not None:
-        chosen = [series for series in series_list if series.uid == uid]
+        chosen = [series for series in series_list if series[0].series_uid == uid]
         if chosen:
             return chosen[0]
-        listing = "; ".join(series.summary for series in series_list)
+        listing = "; ".join(map(_summarise_series, series_list))
         raise ImageError(
             "no series of this folder has the UID asked for", file=folder, remedy=f"there are: {listing}"
         )
     if len(series_list) > 1:
-        shown = "; ".join(series.summary for series in series_list[:6])
+        shown = "; ".join(map(_summarise_series, series_list[:6]))
         more = f"; and {len(series_list) - 6} more" if len(series_list) > 6 else ""
         raise ImageError(
             f"{len(series_list)} series in one folder",
@@ -153,18 +139,24 @@ def _choose_series(folder: Path, series_list: list[Series], uid: str | None) -> 
     return series_list[0]
 
 
+def _summarise_series(series: Series) -> str:
+    first = series[0]
+    number = f"series {first.series_number}, " if first.series_number.isdecimal() else ""
+    return f"{number}{len(series)} x {first.rows} x {first.columns}, UID {first.series_uid}"
+
+
 def _is_one_stack(series: list[Series]) -> bool:
     """True if an anonymiser gave each slice of one series its own UID.
 
     Then every series has one image, and there are at least three, all with the same series number and
     geometry: two true series would not interleave into one stack, which the gap check still verifies.
     """
-    if len(series) < 3 or any(len(single.slices) > 1 for single in series):
-        return False
-    slices = [single.slices[0] for single in series]
-    first = slices[0]
-    return all(
-        other.series_number == first.series_number and has_same_plane(first, other) for other in slices
+    first = series[0][0]
+    return len(series) > 2 and all(
+        len(single) == 1
+        and single[0].series_number == first.series_number
+        and has_same_plane(first, single[0])
+        for single in series
     )
 
 

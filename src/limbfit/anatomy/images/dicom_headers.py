@@ -183,11 +183,7 @@ def _read_slice(
 
 def find_functional_group(groups: tuple[Dataset, Dataset], name: str) -> Dataset:
     """A functional group of a frame: its own, else the one shared by all frames, else an empty one."""
-    for group in groups:
-        items = group.get(name)
-        if items:
-            return items[0]
-    return Dataset()
+    return next((items[0] for group in groups if (items := group.get(name))), Dataset())
 
 
 def _to_numbers(value: object, count: int) -> Array | None:

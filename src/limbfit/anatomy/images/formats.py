@@ -12,7 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import IO, NamedTuple
+from typing import IO
 
 import numpy as np
 import SimpleITK as sitk  # noqa: N813
@@ -83,19 +83,6 @@ def _read_itk(path: Path, place_keys: tuple[str, ...] = (), by: str = "") -> sit
     return image
 
 
-def _read_nifti(path: Path) -> sitk.Image:
-    check_nifti(path)
-    return _read_itk(path, ("qform_code", "sform_code"))
-
-
-_BUILTIN = (
-    ImageFormat("NIfTI", (".nii", ".nii.gz"), _read_nifti, is_written=True),
-    ImageFormat("NRRD", (".nrrd", ".nhdr"), partial(_read_itk, place_keys=("NRRD_space",)), is_written=True),
-    ImageFormat("MetaImage", (".mha", ".mhd"), partial(_read_itk, by="MetaImageIO"), is_written=True),
-)
-IMAGE_FORMATS = Registry("image format", {known.name: known for known in _BUILTIN})
-
-
 def register_image_format(name: str, suffixes: tuple[str, ...], read: Read) -> None:
     """Make files of some suffixes readable, in the file that a study names in ``study.extensions``.
 
@@ -147,9 +134,9 @@ def read_image(path: Path) -> sitk.Image:
     return image
 
 
-def check_nifti(path: Path) -> None:
-    """Raise `ImageError` for a NIfTI file that is cut short, holds voxels that are not numbers, or whose two
-    statements of its place differ in left and right."""
+def _read_nifti(path: Path) -> sitk.Image:
+    """An image by ITK. Raises `ImageError` for a NIfTI file that is cut short, holds voxels that are not
+    numbers, or whose two statements of its place differ in left and right."""
     try:
         with _open(path) as stream:
             header = _read_header(stream)
@@ -166,20 +153,13 @@ def check_nifti(path: Path) -> None:
     if bad:
         raise ImageError(f"{bad} voxels are not numbers", file=path, remedy="export the image again")
     forms = _read_forms(path)
-    if forms is not None and np.linalg.det(forms.qform[:3, :3]) * np.linalg.det(forms.sform[:3, :3]) < 0.0:
+    if forms is not None and np.prod([np.linalg.det(form[:3, :3]) for form in forms[:2]]) < 0.0:
         raise ImageError(
             "the qform and the sform mirror each other: left in one is right in the other",
             file=path,
             remedy="convert the image again from its DICOM files, or set the code of the wrong one to 0",
         )
-
-
-class _HeaderForms(NamedTuple):
-    """What a header says twice: affine matrices (4, 4) from indices to RAS mm, for an image of a size."""
-
-    qform: Array
-    sform: Array
-    size: Array
+    return _read_itk(path, ("qform_code", "sform_code"))
 
 
 def describe_forms(path: Path, affine: Array) -> tuple[str, ...]:
@@ -190,12 +170,13 @@ def describe_forms(path: Path, affine: Array) -> tuple[str, ...]:
     forms = _read_forms(path)
     if forms is None:
         return ()
-    corners = np.stack(np.meshgrid(*np.column_stack([np.zeros(3), forms.size - 1]), [1.0]), -1).reshape(-1, 4)
-    apart = float(np.linalg.norm(corners @ (forms.qform - forms.sform).T, axis=1).max())
+    qform, sform, size = forms
+    corners = np.stack(np.meshgrid(*np.column_stack([np.zeros(3), size - 1]), [1.0]), -1).reshape(-1, 4)
+    apart = float(np.linalg.norm(corners @ (qform - sform).T, axis=1).max())
     if apart <= _SAME_VOXELS * np.linalg.norm(affine[:3, :3], axis=0).min():
         return ()
     here = np.diag([-1.0, -1.0, 1.0, 1.0]) @ affine
-    is_qform = np.abs(here - forms.qform).max() <= np.abs(here - forms.sform).max()
+    is_qform = np.abs(here - qform).max() <= np.abs(here - sform).max()
     used, other = ("qform", "sform") if is_qform else ("sform", "qform")
     return (
         f"its qform and sform differ by up to {apart:.1f} mm; the {used} is used: where sites or labels are "
@@ -203,8 +184,9 @@ def describe_forms(path: Path, affine: Array) -> tuple[str, ...]:
     )
 
 
-def _read_forms(path: Path) -> _HeaderForms | None:
-    """The qform and the sform of a file; None where it does not state both."""
+def _read_forms(path: Path) -> tuple[Array, Array, Array] | None:
+    """The qform and the sform of a file, affine matrices (4, 4) from indices to RAS mm, and the size (3,) of
+    its image; None where it does not state both."""
     with _open(path) as stream:
         header = _read_header(stream)
     pixdim, place, rows = (header[name].astype(float) for name in ("pixdim", "qform", "sform"))
@@ -216,7 +198,7 @@ def _read_forms(path: Path) -> _HeaderForms | None:
     qform[:3, :3] = turn * pixdim[1:4] * [1.0, 1.0, -1.0 if pixdim[0] < 0.0 else 1.0]
     qform[:3, 3] = place[3:]
     scale = np.diag([*[_UNITS_MM.get(int(header["units"]) & 7, 1.0)] * 3, 1.0])
-    return _HeaderForms(scale @ qform, scale @ sform, header["dim"][1:4].astype(float))
+    return scale @ qform, scale @ sform, header["dim"][1:4].astype(float)
 
 
 def _open(path: Path) -> IO[bytes] | gzip.GzipFile:
@@ -246,3 +228,11 @@ def _count_bytes_and_nans(stream: IO[bytes] | gzip.GzipFile, header: np.void) ->
                 values = values.byteswap()
             bad += int((~np.isfinite(values)).sum())
     return length, bad
+
+
+_BUILTIN = (
+    ImageFormat("NIfTI", (".nii", ".nii.gz"), _read_nifti, is_written=True),
+    ImageFormat("NRRD", (".nrrd", ".nhdr"), partial(_read_itk, place_keys=("NRRD_space",)), is_written=True),
+    ImageFormat("MetaImage", (".mha", ".mhd"), partial(_read_itk, by="MetaImageIO"), is_written=True),
+)
+IMAGE_FORMATS = Registry("image format", {known.name: known for known in _BUILTIN})

@@ -191,14 +191,22 @@ def _find_odd_slices(mask: Mask, spacing: Array) -> list[tuple[int, str]]:
     if empty or last - first < 6:
         return empty
     area, centre = areas[first : last + 1], _compute_centroids(mask[first : last + 1], spacing)
+    expected = (area[:-2] + area[2:]) / 2  # the mean of the slice before and the slice after
+    off = np.pad((area[1:-1] - expected) / expected, 1)
+    aside = np.pad(np.linalg.norm(centre[1:-1] - (centre[:-2] + centre[2:]) / 2, axis=1), 1)
+    change = np.pad(np.diff(area) / np.maximum(area[1:], area[:-1]), (1, 0))
     reach = max(1, round(_END_MM / spacing[2]))
     low = reach if first > 0 else 1
     high = len(area) - (reach if last < len(areas) - 1 else 1)
     inner = np.zeros(len(area), dtype=bool)
     inner[low:high] = True
-    found = _find_outlying_slices(area, centre, inner)
+    places = _find_peaks(off, _MIN_AREA_CHANGE, inner)
+    found = [(k, f"area {off[k]:+.0%} of what its neighbours have") for k in places]
+    places = _find_peaks(aside, _CENTRE_MM, inner)
+    found += [(k, f"{aside[k]:.1f} mm beside its neighbours") for k in places]
     known = {k + step for k, _ in found for step in (-1, 0, 1)}
-    found += [jump for jump in _find_area_jumps(area, inner) if jump[0] not in known]
+    places = [k for k in _find_peaks(change, _MIN_AREA_JUMP, inner) if k not in known]
+    found += [(k, f"area jumps by {change[k]:+.0%}") for k in places]
     return [(first + k, what) for k, what in found]
 
 
@@ -211,33 +219,10 @@ def _compute_centroids(mask: Mask, spacing: Array) -> Array:
     return np.column_stack([x, y])
 
 
-def _find_outlying_slices(area: Array, centre: Array, inner: Mask) -> list[tuple[int, str]]:
-    """Slices off the mean of the slice before and the slice after."""
-    expected = (area[:-2] + area[2:]) / 2
-    off = np.pad((area[1:-1] - expected) / expected, 1)
-    aside = np.pad(np.linalg.norm(centre[1:-1] - (centre[:-2] + centre[2:]) / 2, axis=1), 1)
-    found = []
-    for k in _find_peaks(np.abs(off), np.maximum(_MIN_AREA_CHANGE, _OUTLIER * _spread(off[inner])), inner):
-        found.append((k, f"area {off[k]:+.0%} of what its neighbours have"))
-    for k in _find_peaks(aside, max(_CENTRE_MM, _OUTLIER * _spread(aside[inner])), inner):
-        found.append((k, f"{aside[k]:.1f} mm beside its neighbours"))
-    return found
-
-
-def _find_area_jumps(area: Array, inner: Mask) -> list[tuple[int, str]]:
-    """Slices at which the area changes for good."""
-    change = np.pad(np.diff(area) / np.maximum(area[1:], area[:-1]), (1, 0))
-    limit = max(_MIN_AREA_JUMP, _OUTLIER * _spread(change[inner]))
-    return [(k, f"area jumps by {change[k]:+.0%}") for k in _find_peaks(np.abs(change), limit, inner)]
-
-
-def _spread(values: Array) -> float:
-    """Standard deviation of the bulk of the values."""
-    return 1.4826 * float(np.median(np.abs(values - np.median(values)))) if len(values) else 0.0
-
-
-def _find_peaks(values: Array, limit: float, inner: Mask) -> list[int]:
-    """Where values pass the limit and are the largest of their neighbours'."""
-    padded = np.pad(values, 1)
-    highest = (values >= padded[:-2]) & (values >= padded[2:])
-    return [int(k) for k in np.flatnonzero(inner & highest & (values > limit))]
+def _find_peaks(values: Array, least: float, inner: Mask) -> list[int]:
+    """Slices whose values are far from 0: by more than ``least``, than the bulk of them, and than beside."""
+    size, bulk = np.abs(values), values[inner]
+    spread = 1.4826 * float(np.median(np.abs(bulk - np.median(bulk)))) if len(bulk) else 0.0
+    padded = np.pad(size, 1)
+    highest = (size >= padded[:-2]) & (size >= padded[2:])
+    return [int(k) for k in np.flatnonzero(inner & highest & (size > max(least, _OUTLIER * spread)))]

@@ -19,7 +19,7 @@ import csv
 import json
 import re
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -29,6 +29,7 @@ from contourpy import contour_generator
 from numpy.typing import NDArray
 from pydicom.dataset import Dataset, FileDataset
 from pydicom.errors import InvalidDicomError
+from pydicom.misc import is_dicom
 
 from ...arrays import Array, Indices, Mask
 from ...errors import LabelError, add_location
@@ -103,31 +104,21 @@ def read_label_image(path: Path, image: sitk.Image) -> LabelMap:
     """Any scalar label image; names from ``<file>.json`` (``{"2": "tibia"}``) or the default ones."""
     if image.GetNumberOfComponentsPerPixel() != 1:
         raise LabelError("a label image has one value per voxel")
-    return LabelMap(sitk.GetArrayFromImage(image), *read_geometry(image), _read_sidecar_names(path))
+    names, file = dict(DEFAULT_NAMES), find_sidecar(path)
+    if file.is_file():
+        try:
+            stated = json.loads(file.read_text("utf-8"))
+            names = {int(value): normalise_name(name) for value, name in stated.items()}
+        except (ValueError, AttributeError):
+            raise LabelError(
+                "the names of the labels cannot be read", file=file, remedy='write {"2": "tibia", ...}'
+            ) from None
+    return LabelMap(sitk.GetArrayFromImage(image), *read_geometry(image), names)
 
 
 def find_sidecar(path: Path) -> Path:
     """The JSON file that holds the names of a plain label image."""
     return path.with_name(path.name + ".json")
-
-
-def write_sidecar(path: Path, names: Mapping[int, str]) -> None:
-    text = json.dumps({str(value): name for value, name in sorted(names.items())}, indent=2)
-    find_sidecar(path).write_text(text + "\n", encoding="utf-8")
-
-
-def _read_sidecar_names(path: Path) -> dict[int, str]:
-    file = find_sidecar(path)
-    if not file.is_file():
-        return dict(DEFAULT_NAMES)
-    try:
-        return {
-            int(value): normalise_name(name) for value, name in json.loads(file.read_text("utf-8")).items()
-        }
-    except (ValueError, AttributeError):
-        raise LabelError(
-            "the names of the labels cannot be read", file=file, remedy='write {"2": "tibia", ...}'
-        ) from None
 
 
 def _read_segments(image: sitk.Image, layers: int) -> list[tuple[str, int, int]]:
@@ -222,10 +213,7 @@ def fill_even_odd(polygons: Sequence[Array], columns: int, rows: int) -> Mask:
 
 def find_outlines(mask: Mask) -> list[Array]:
     """Closed polygons (n, 2) of a slice's mask ``[j, i]`` as (i, j), half-way between pixel centres."""
-    if not mask.any():
-        return []
-    padded = np.pad(mask, 1).astype(float)
-    lines = contour_generator(z=padded).lines(0.5)
+    lines = contour_generator(z=np.pad(mask, 1).astype(float)).lines(0.5)
     return [np.asarray(line)[:-1] - 1.0 for line in lines]
 
 
@@ -257,8 +245,16 @@ def read_contours(path: str | Path, like: Volume) -> LabelMap:
 
 def _read_polygons(path: Path) -> dict[str, list[Array]]:
     """The contours (n, 3) of each structure of a file, LPS mm."""
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as stream:
+            reader = csv.DictReader(stream)
+            if reader.fieldnames is None or any(name not in reader.fieldnames for name in CONTOUR_COLUMNS):
+                raise LabelError("not a file of contours", remedy=_CONTOUR_FORMAT)
+            rows = [(reader.line_num, row) for row in reader]
+    except (OSError, UnicodeDecodeError, csv.Error):
+        raise LabelError("the contours cannot be read", remedy=_CONTOUR_FORMAT) from None
     found: dict[str, dict[tuple[int, int], list[list[float]]]] = defaultdict(lambda: defaultdict(list))
-    for line, row in _read_rows(path):
+    for line, row in rows:
         try:
             name, key = normalise_name(row["label"]), (int(row["slice"]), int(row["contour"]))
             point = [float(row[axis]) for axis in CONTOUR_COLUMNS[3:]]
@@ -286,19 +282,6 @@ def build_labels(structures: Sequence[tuple[str, Sequence[Array]]], like: Grid) 
     return LabelMap(array, *like.geometry, names)
 
 
-def _read_rows(path: Path) -> Iterator[tuple[int, dict[str, str]]]:
-    """Rows of the file with the number of their line."""
-    try:
-        with path.open(encoding="utf-8-sig", newline="") as stream:
-            rows = csv.DictReader(stream)
-            if rows.fieldnames is None or any(name not in rows.fieldnames for name in CONTOUR_COLUMNS):
-                raise LabelError("not a file of contours", remedy=_CONTOUR_FORMAT)
-            for row in rows:
-                yield rows.line_num, row
-    except (OSError, UnicodeDecodeError, csv.Error):
-        raise LabelError("the contours cannot be read", remedy=_CONTOUR_FORMAT) from None
-
-
 def find_dicom_labels(path: Path) -> Path | None:
     """The DICOM-SEG or RTSTRUCT that ``path`` is, or that is the only one in it; None for another file.
     Raises `LabelError` for a folder without or with several of them, and for DICOM of another kind.
@@ -311,7 +294,7 @@ def find_dicom_labels(path: Path) -> Path | None:
                 remedy="name the file",
             )
         return found[0]
-    if not path.is_file() or not _is_dicom(path):
+    if not path.is_file() or not (path.suffix.lower() == ".dcm" or is_dicom(path)):
         return None
     if _find_storage_class(path) is None:
         raise LabelError(
@@ -340,11 +323,6 @@ def read_dicom_labels(path: Path, like: Volume | None) -> LabelMap:
         grid, masks, labels = _read_masks(pydicom.dcmread(path))
         array, names = flatten(masks, [normalise_name(label) for label in labels])
     return LabelMap(array, *grid.geometry, names)
-
-
-def _is_dicom(path: Path) -> bool:
-    with path.open("rb") as stream:
-        return stream.read(132)[128:] == b"DICM" or path.suffix.lower() == ".dcm"
 
 
 def _find_storage_class(path: Path) -> str | None:

@@ -10,6 +10,7 @@ import sys
 import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -56,29 +57,12 @@ class VolumeTask(VolumeMesh):
     hausdorff_mm: float
 
 
-def run_mmg(task: VolumeTask, time_limit_s: float) -> VolumeMesh:
-    """Adapt with MMG (Dapogny, Dobrzynski, Frey 2014, J Comput Phys 262, 358-378). Raises `MesherError` when
-    MMG crashes, gives nothing or exceeds the time limit.
+def run_engine(engine: str, task: VolumeTask, time_limit_s: float) -> VolumeMesh:
+    """Adapt with MMG (Dapogny, Dobrzynski, Frey 2014, J Comput Phys 262, 358-378), or remesh the surface with
+    it and fill that with Netgen (Schoeberl 1997, Comput Visual Sci 1, 41-52).
+
+    Raises `MesherError` when the engine crashes, gives nothing or exceeds the time limit.
     """
-    return _run_engine("MMG", task, time_limit_s)
-
-
-def run_netgen(task: VolumeTask, time_limit_s: float) -> VolumeMesh:
-    """Remesh the surface with MMG and fill it with Netgen (Schoeberl 1997, Comput Visual Sci 1, 41-52).
-    Raises `MeshingError` when Netgen is not installed, or there are regions inside the core, which it would
-    not see; when it crashes, gives nothing or exceeds the time limit (`MesherError`).
-    """
-    if task.regions.any():
-        raise MeshingError('Netgen knows no regions inside the core; choose mesh.engine = "mmg"')
-    if find_spec("netgen") is None:
-        raise MeshingError(
-            "the mesher Netgen is not installed; install it with  pip install 'limbfit[netgen]'  "
-            'or choose mesh.engine = "mmg"'
-        )
-    return _run_engine("Netgen", task, time_limit_s)
-
-
-def _run_engine(engine: str, task: VolumeTask, time_limit_s: float) -> VolumeMesh:
     with tempfile.TemporaryDirectory(prefix="limbfit-mesh-") as folder:
         source, target = Path(folder, "task.npz"), Path(folder, "mesh.npz")
         np.savez(source, **{name: getattr(task, name) for name in task.__dataclass_fields__})
@@ -87,6 +71,20 @@ def _run_engine(engine: str, task: VolumeTask, time_limit_s: float) -> VolumeMes
             raise MesherError(f"the mesher {engine} gave no mesh; choose larger edges or thicker layers")
         with np.load(target) as stored:
             return VolumeMesh(**{name: stored[name] for name in VolumeMesh.__dataclass_fields__})
+
+
+def run_netgen(task: VolumeTask, time_limit_s: float) -> VolumeMesh:
+    """See `run_engine`. Raises `MeshingError`, too, when Netgen is not installed, or there are regions inside
+    the core, which it would not see.
+    """
+    if task.regions.any():
+        raise MeshingError('Netgen knows no regions inside the core; choose mesh.engine = "mmg"')
+    if find_spec("netgen") is None:
+        raise MeshingError(
+            "the mesher Netgen is not installed; install it with  pip install 'limbfit[netgen]'  "
+            'or choose mesh.engine = "mmg"'
+        )
+    return run_engine("Netgen", task, time_limit_s)
 
 
 def run_worker(command: list[str], time_limit_s: float) -> None:
@@ -108,4 +106,7 @@ def run_worker(command: list[str], time_limit_s: float) -> None:
         )
 
 
-ENGINES: dict[str, Callable[[VolumeTask, float], VolumeMesh]] = {"mmg": run_mmg, "netgen": run_netgen}
+ENGINES: dict[str, Callable[[VolumeTask, float], VolumeMesh]] = {
+    "mmg": partial(run_engine, "MMG"),
+    "netgen": run_netgen,
+}

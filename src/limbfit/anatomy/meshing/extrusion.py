@@ -20,6 +20,7 @@ import numpy as np
 
 from ...arrays import Array, Indices
 from ...mesh import Mesh, boundary_faces
+from ..surfaces.triangles import find_half_edges
 from .background import BONE, LAYER, project_to_level
 from .engines import VolumeMesh
 from .layers import LimbFields
@@ -66,8 +67,7 @@ def extrude_layers(core: VolumeMesh, fields: LimbFields, regions: tuple[str, ...
 
 def _choose_steps(interface: Indices, low: Array, depths: Array) -> Indices:
     """Elements (layers, b) across each layer in each column, innermost layer first."""
-    ends = np.sort(np.vstack([interface[:, [0, 1]], interface[:, [1, 2]], interface[:, [2, 0]]]), axis=1)
-    edges = np.unique(ends, axis=0)
+    edges = np.unique(np.sort(find_half_edges(interface), axis=1), axis=0)
     length = np.linalg.norm(low[edges[:, 0]] - low[edges[:, 1]], axis=1)
     degree = np.bincount(edges.ravel(), minlength=len(low))
     mean = np.bincount(edges.ravel(), np.repeat(length, 2), minlength=len(low)) / degree

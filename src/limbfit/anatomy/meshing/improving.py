@@ -13,7 +13,6 @@ moved off the bone by what the faces around them lack.
 
 from collections.abc import Callable
 from dataclasses import replace
-from itertools import count
 
 import numpy as np
 
@@ -77,17 +76,15 @@ def smooth_elements(mesh: Mesh, fields: LimbFields, stack: Columns) -> Mesh:
     two of them not at all. Where the limb was cut off about the site, the boundary has no shape to keep.
     """
     normals, movable = find_constraints(mesh, fields, stack)
-    propose = limit_moves(mesh.points, normals, _find_places(mesh, stack)[1], fields)
+    propose = limit_moves(mesh.points, normals, _find_surfaces(mesh, fields, stack)[0][1], fields)
     points = improve_angles(mesh.points, mesh.cells, IMPROVED_BELOW_DEG, propose, movable)
     return mesh.with_points(project_nodes(points, mesh, fields, stack))
 
 
 def project_nodes(points: Array, mesh: Mesh, fields: LimbFields, stack: Columns) -> Array:
     """Moved points (n, 3) of a mesh, those of surfaces put on them as far as cells allow."""
-    on_plane, in_layers, on_bone = _find_places(mesh, stack)
-    walls = _find_region_walls(mesh, fields)
+    (on_plane, _, on_bone), walls, alone = _find_surfaces(mesh, fields, stack)
     target, free = points.copy(), np.where(on_plane, 0.0, 1.0)
-    alone = np.sum([on_plane, in_layers, on_bone, *(chosen for chosen, _ in walls)], axis=0) < 2
     own = [(np.flatnonzero(chosen & alone), level) for chosen, level in (*walls, (on_bone, fields.void))]
     for nodes, level in (*own, (stack.base, fields.layer), (stack.top, fields.depth)):
         target[nodes] = project_to_level(level, target[nodes], free[nodes])
@@ -97,32 +94,29 @@ def project_nodes(points: Array, mesh: Mesh, fields: LimbFields, stack: Columns)
 def find_constraints(mesh: Mesh, fields: LimbFields, stack: Columns) -> tuple[Array, Mask]:
     """Unit normals (n, 3) of the surface that a node moves on, zero for inner ones; which may move (n,)."""
     points = mesh.points
-    on_plane, in_layers, on_bone = _find_places(mesh, stack)
+    (on_plane, in_layers, on_bone), walls, alone = _find_surfaces(mesh, fields, stack)
     normals = np.where(on_plane[:, None], [0.0, 0.0, 1.0], np.zeros((len(points), 3)))
-    walls = _find_region_walls(mesh, fields)
     for chosen, level in ((in_layers, fields.depth), (on_bone, fields.void), *walls):
         slope = level(points[chosen])[1]
         normals[chosen] = slope / np.maximum(np.linalg.norm(slope, axis=1, keepdims=True), 1e-12)
-    return normals, np.sum([on_plane, in_layers, on_bone, *(chosen for chosen, _ in walls)], axis=0) < 2
+    return normals, alone
 
 
-def _find_region_walls(mesh: Mesh, fields: LimbFields) -> list[tuple[Mask, Field]]:
-    """Mask (n,) of the nodes on the surface of each region inside the core, and the region's level."""
-    found = []
-    for number, faces in enumerate(find_interfaces(mesh, len(fields.depths))):
-        chosen = np.zeros(len(mesh.points), dtype=bool)
-        chosen[faces] = True
-        found.append((chosen, build_region_level(fields, number)))
-    return found
-
-
-def _find_places(mesh: Mesh, stack: Columns) -> Mask:
-    """Masks (3, n) of the nodes on the cut plane, in the layers, and on bone."""
-    places = np.zeros((3, len(mesh.points)), dtype=bool)
+def _find_surfaces(
+    mesh: Mesh, fields: LimbFields, stack: Columns
+) -> tuple[Mask, list[tuple[Mask, Field]], Mask]:
+    """Masks (3, n) of the nodes on the cut plane, in the layers, and on bone; that (n,) of the nodes on the
+    surface of each region inside the core, with the region's level; that (n,) of nodes on one of them at
+    most."""
+    interfaces = find_interfaces(mesh, len(fields.depths))
+    places = np.zeros((3 + len(interfaces), len(mesh.points)), dtype=bool)
     places[0] = mesh.points[:, 2] == 0.0
     places[1, stack.base] = places[1, stack.top[0] :] = True
     places[2, mesh.node_sets["fixed_bone"]] = True
-    return places
+    for chosen, faces in zip(places[3:], interfaces):
+        chosen[faces] = True
+    walls = [(chosen, build_region_level(fields, number)) for number, chosen in enumerate(places[3:])]
+    return places[:3], walls, places.sum(axis=0) < 2
 
 
 def improve_angles(
@@ -337,8 +331,8 @@ def curve_mesh(mesh: Mesh, target: Array, straight: Array) -> Mesh:
 
     ``straight`` (m,) is the least Jacobian of each element with straight sides.
     """
-    share = np.ones(len(mesh.points))
-    for attempt in count():
+    share, attempt = np.ones(len(mesh.points)), 0
+    while True:
         points = mesh.points + share[:, None] * (target - mesh.points)
         moved = replace(mesh, points=points)
         bad = (node_jacobians(moved).min(axis=1) < SMALLEST_JACOBIAN * straight) & (straight > 0.0)
@@ -346,7 +340,7 @@ def curve_mesh(mesh: Mesh, target: Array, straight: Array) -> Mesh:
         if not share[nodes].any():
             return moved
         share[nodes] = share[nodes] / 2 if attempt < BISECTIONS - 1 else 0.0
-    raise AssertionError("each pass straightens more")
+        attempt += 1
 
 
 def compute_curved_target(mesh: Mesh, fields: LimbFields) -> Array:

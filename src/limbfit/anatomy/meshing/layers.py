@@ -135,14 +135,10 @@ class LimbFields:
         # A bone's shallow part spans at most its own edge length beyond its shallow vertices.
         corners = bone.triangles
         pad = float(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max())
-        low, high = shallow.min(axis=0) - pad, shallow.max(axis=0) + pad
-        high[2] = min(high[2], 0.0)
-        spacing = (np.prod(high - low) / TRIM_SAMPLES) ** (1 / 3)
-        samples = sample_box(low, high, spacing)
+        samples, whole = sample_box(shallow, pad, TRIM_SAMPLES)
         inside = evaluate_distance(bone, samples)[0] < 0
         cut = self.layer(samples[inside])[0] < self.bone_clearance_mm
-        volume = cut.sum() * np.prod(high - low) / len(samples)
-        return BoneLoss(volume_mm3=volume, depth_mm=excess.max())
+        return BoneLoss(volume_mm3=cut.sum() * whole / len(samples), depth_mm=excess.max())
 
 
 def build_limb_fields(
@@ -256,11 +252,17 @@ def compute_box_distance(surface: Surface, points: Array) -> Array:
     return np.where(distance > 0, distance, -np.inf)
 
 
-def sample_box(low: Array, high: Array, spacing: float) -> Array:
-    """Cell centres of a regular grid over a box."""
-    counts = np.maximum(1, np.round((high - low) / spacing)).astype(int)
+def sample_box(points: Array, pad_mm: float, count: int) -> tuple[Array, float]:
+    """About ``count`` cell centres (k, 3) of a grid over the box of points (n, 3) below the cut, wider by
+    ``pad_mm``, and the box's volume, mm3; none where all of it is beyond the cut."""
+    low, high = points.min(axis=0) - pad_mm, points.max(axis=0) + pad_mm
+    high[2] = min(high[2], 0.0)
+    if high[2] <= low[2]:
+        return np.zeros((0, 3)), 0.0
+    whole = float(np.prod(high - low))
+    counts = np.maximum(1, np.round((high - low) / (whole / count) ** (1 / 3))).astype(int)
     axes = [lo + (np.arange(n) + 0.5) * (hi - lo) / n for lo, hi, n in zip(low, high, counts)]
-    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3), whole
 
 
 def build_liner_surface(

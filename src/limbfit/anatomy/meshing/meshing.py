@@ -204,7 +204,9 @@ def mesh_limb(
     proximal cut than ``fine_to_mm``.
     """
     base = build_base_mesh(anatomy, settings, fat_depth_mm)
-    return _mesh_base(base, compute_limb_size(base, fine_to_mm, settings), settings)
+    points = base.grid.points
+    beyond = np.maximum(points[:, 2] + fine_to_mm, 0.0) + np.maximum(base.fields.layer(points)[0], 0.0)
+    return _mesh_base(base, _grade_size(beyond, base.size_limit, settings), settings)
 
 
 def _mesh_base(
@@ -267,13 +269,6 @@ def compute_site_size(points: Array, limit: Array, site: Array, axis: Array, set
     return _grade_size(np.maximum(distance - settings.near_radius_mm, 0.0), limit, settings)
 
 
-def compute_limb_size(base: BaseMesh, fine_to_mm: float, settings: MeshSettings) -> Array:
-    """Wanted edge length (n,) at a whole limb's grid points: short under its layers, not near the cut."""
-    points = base.grid.points
-    beyond = np.maximum(points[:, 2] + fine_to_mm, 0.0) + np.maximum(base.fields.layer(points)[0], 0.0)
-    return _grade_size(beyond, base.size_limit, settings)
-
-
 def _grade_size(beyond: Array, limit: Array, settings: MeshSettings) -> Array:
     """Edge length (n,) at distances (n,) beyond where it is shortest, at most ``limit`` (n,)."""
     size = np.minimum(settings.edge_near_mm + settings.growth * beyond, settings.edge_far_mm)
@@ -294,9 +289,9 @@ def compute_size_limit(fields: LimbFields, grid: TetGrid, settings: MeshSettings
     depths = fields.layer_depths(grid.points)
     thinnest = np.diff(depths, axis=0, prepend=0.0).min(axis=0)
     limit = np.minimum(LAYER_RATIO * settings.flatness * thinnest + under_layers, over_bone)
-    for number in range(len(fields.regions)):
+    for number, surface in enumerate(fields.regions.values()):
         away = evaluate(regions.build_region_level(fields, number))
-        edge = max(REGION_RATIO * regions.measure_thickness(fields, number), settings.edge_near_mm)
+        edge = max(REGION_RATIO * regions.measure_thickness(surface), settings.edge_near_mm)
         limit = np.minimum(limit, edge + np.maximum(away, 0.0))
     return limit
 

@@ -1,6 +1,7 @@
 """What a site mesh is like: counts, angles, layers, volumes, and what was trimmed."""
 
 from collections.abc import Mapping
+from itertools import pairwise
 from typing import Any
 
 import igl
@@ -18,7 +19,7 @@ from .regions import build_region_level, find_interfaces
 # Smallest angle near the indenter, and anywhere: far off, layers are thin beside the edges and strain little.
 GOOD_DIHEDRAL_DEG, SOUND_DIHEDRAL_DEG = 8.0, 3.0
 LOST_MM = 4.0  # bone that the mesh misses by more than that on a tenth of its surface is lost in part
-TRIMMED_MM = 0.5  # from the bone as trimmed: surface that was not left out on purpose
+TRIMMED_MM = 0.5  # from the bone as trimmed
 SEEN_RADII = 1.5  # of the zone whose elements have to be good: bone that bears an indentation
 GOOD_VOLUME = 0.02  # long edges far from the indenter cut across a round limb by up to a hundredth
 
@@ -51,9 +52,10 @@ def measure_mesh(
         *(_split_into_facets(find_inner_faces(mesh, i)) for i in range(layers)),
     ]
     whole = _measure_thickness(mesh, faces[-1], faces[0])
+    between = [_measure_thickness(mesh, inner, outer) for outer, inner in pairwise(faces)]
     each = {
-        name: _summarise(_measure_thickness(mesh, faces[i + 1], faces[i]))
-        for i, name in enumerate(mesh.region_names[:layers])
+        name: ThicknessMeasures(mean=mm.mean(), std=mm.std(), min=mm.min(), max=mm.max())
+        for name, mm in zip(mesh.region_names, between)
     }
     error = np.abs(fields.layer(mesh.points[faces[-1]].mean(axis=1))[0])
     return MeshMeasures(
@@ -117,16 +119,16 @@ def check_quality(
 def warn_of_lost_bone(mesh: Mesh, fields: LimbFields, near: tuple[Array, float] | None) -> tuple[str, ...]:
     """Which bones about a site a mesh in the limb frame lacks in part; ``near``: the place (3,) and radius
     (mm) within which elements have to be good, None for all of the limb."""
-    bones = {
-        name: places
-        for name, bone in fields.bones.items()
-        if len(places := _select_kept_vertices(fields, bone.points, near))
-    }
-    if not bones:
-        return ()
     faces = find_bone_faces(mesh)[:, :3]
     warnings = []
-    for name, places in bones.items():
+    for name, bone in fields.bones.items():
+        places = bone.points[bone.points[:, 2] < -LOST_MM]
+        if near is not None:
+            place, radius = near
+            places = places[np.linalg.norm(places - place, axis=1) < SEEN_RADII * radius]
+        places = places[np.abs(fields.void(places)[0]) < TRIMMED_MM]  # what was not left out on purpose
+        if not len(places):
+            continue
         squared = igl.point_mesh_squared_distance(places, mesh.points, faces)[0] if len(faces) else np.inf
         off = float(np.quantile(np.sqrt(squared), 0.9))
         if off > LOST_MM:
@@ -137,24 +139,10 @@ def warn_of_lost_bone(mesh: Mesh, fields: LimbFields, near: tuple[Array, float] 
     return tuple(warnings)
 
 
-def _select_kept_vertices(fields: LimbFields, points: Array, near: tuple[Array, float] | None) -> Array:
-    """Of a bone's vertices (n, 3) those below the cut that were not trimmed, near the site."""
-    chosen = points[:, 2] < -LOST_MM
-    if near is not None:
-        place, radius = near
-        chosen &= np.linalg.norm(points - place, axis=1) < SEEN_RADII * radius
-    points = points[chosen]
-    return points[np.abs(fields.void(points)[0]) < TRIMMED_MM] if len(points) else points
-
-
 def _measure_thickness(mesh: Mesh, inner: Indices, outer: Indices) -> Array:
     """Distance (n,) from the middles of inner facets to the surface of outer ones, mm."""
     squared = igl.point_mesh_squared_distance(mesh.points[inner].mean(axis=1), mesh.points, outer)[0]
     return np.asarray(np.sqrt(squared))
-
-
-def _summarise(values: Array) -> ThicknessMeasures:
-    return ThicknessMeasures(mean=values.mean(), std=values.std(), min=values.min(), max=values.max())
 
 
 def _split_into_facets(faces: Indices) -> Indices:
@@ -166,25 +154,19 @@ def _split_into_facets(faces: Indices) -> Indices:
 
 def compute_enclosed_volume(anatomy: Anatomy, fields: LimbFields, trimmed: Mapping[str, BoneLoss]) -> float:
     """Volume (mm3) below the cut that the skin encloses, less the bones as trimmed."""
-    parts = [
-        Surface(fields.frame.to_limb(part.points), part.faces)
+    skin, *bones = [
+        compute_volume_below_cut(Surface(fields.frame.to_limb(part.points), part.faces))
         for part in (anatomy.skin, *anatomy.bones.values())
     ]
-    skin, *bones = [compute_volume_below_cut(part) for part in parts]
     return skin - sum(bones) + sum(part.volume_mm3 for part in trimmed.values())
 
 
 def compute_volume_below_cut(surface: Surface) -> float:
     """Volume (mm3) of a closed surface below z = 0, by the divergence theorem with (0, 0, min(z, 0))."""
-    normal_z = cross_edges(surface.triangles)[:, 2] / 2.0
     low, middle, high = np.sort(surface.triangles[..., 2], axis=1).T
-    return float(normal_z @ _compute_mean_negative_part(low, middle, high))
-
-
-def _compute_mean_negative_part(low: Array, middle: Array, high: Array) -> Array:
-    """Mean of min(z, 0) over triangles whose corners have sorted heights low, middle, high."""
     with np.errstate(divide="ignore", invalid="ignore"):
         tip_below = low**3 / ((low - middle) * (low - high)) / 3.0
         tip_above = high**3 / ((high - low) * (high - middle)) / 3.0
     mean = (low + middle + high) / 3.0
-    return np.select([low >= 0, high <= 0, middle >= 0], [0.0 * mean, mean, tip_below], mean - tip_above)
+    below = np.select([low >= 0, high <= 0, middle >= 0], [0.0 * mean, mean, tip_below], mean - tip_above)
+    return float(cross_edges(surface.triangles)[:, 2] / 2.0 @ below)

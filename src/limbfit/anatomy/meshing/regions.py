@@ -64,31 +64,18 @@ def _measure_to_wall(fields: LimbFields, number: int, points: Array) -> Level:
     return distance, normal
 
 
-def measure_thickness(fields: LimbFields, number: int) -> float:
+def measure_thickness(surface: Surface) -> float:
     """Thickness (mm) of a region where it is thickest: twice the greatest depth in it, below the cut."""
-    surface = list(fields.regions.values())[number]
-    samples, _ = _sample_region(fields, number)
+    samples, _ = sample_box(surface.points, 0.0, SAMPLES)
     return 2.0 * abs(float(evaluate_distance(surface, samples)[0].min(initial=0.0)))
-
-
-def _sample_region(fields: LimbFields, number: int, pad_mm: float = 0.0) -> tuple[Array, float]:
-    """Points (n, 3) all over the box of a region below the cut, and the volume (mm3) that each stands for."""
-    surface = list(fields.regions.values())[number]
-    low, high = surface.points.min(axis=0) - pad_mm, surface.points.max(axis=0) + pad_mm
-    high[2] = min(high[2], 0.0)
-    if high[2] <= low[2]:
-        return np.zeros((0, 3)), 0.0
-    whole = float(np.prod(high - low))
-    samples = sample_box(low, high, (whole / SAMPLES) ** (1 / 3))
-    return samples, whole / len(samples)
 
 
 def check_regions(fields: LimbFields, edge_near_mm: float) -> None:
     """Refuse regions that are too thin for a mesh. Raises `SurfaceError` for one that is thinner than half an
     edge near the site.
     """
-    for number, name in enumerate(fields.regions):
-        thick = measure_thickness(fields, number)
+    for name, surface in fields.regions.items():
+        thick = measure_thickness(surface)
         if thick < MIN_EDGES_ACROSS * edge_near_mm:
             raise SurfaceError(
                 f"the region is {thick:.1f} mm thick at most, too thin for edges of {edge_near_mm:g} mm",
@@ -99,8 +86,8 @@ def check_regions(fields: LimbFields, edge_near_mm: float) -> None:
 
 def refine_at_regions(grid: TetGrid, fields: LimbFields) -> TetGrid:
     """A box's grid, fine enough about each region to be cut at its surface."""
-    for number, surface in enumerate(fields.regions.values()):
-        spacing = measure_thickness(fields, number) / CELLS_ACROSS
+    for surface in fields.regions.values():
+        spacing = measure_thickness(surface) / CELLS_ACROSS
         grid = refine_grid(grid, partial(_is_near, surface, LONGEST_EDGE * spacing), spacing)
     return grid
 
@@ -134,13 +121,13 @@ def cut_at_regions(grid: TetGrid, fields: LimbFields) -> TetGrid:
 def compute_region_volumes(fields: LimbFields) -> dict[str, float]:
     """Volume (mm3) of each region under the layers, between the bones and the regions before it."""
     found = {}
-    for number, name in enumerate(fields.regions):
-        samples, cell = _sample_region(fields, number, fields.bone_clearance_mm)
+    for number, (name, surface) in enumerate(fields.regions.items()):
+        samples, whole = sample_box(surface.points, fields.bone_clearance_mm, SAMPLES)
         levels = [build_region_level(fields, before)(samples)[0] for before in range(number + 1)]
         inside = (levels.pop() < 0.0) & (fields.layer(samples)[0] > 0.0) & (fields.void(samples)[0] > 0.0)
         for before in levels:
             inside &= before > 0.0
-        found[name] = float(inside.sum()) * cell
+        found[name] = float(inside.sum()) * (whole / max(len(samples), 1))
     return found
 
 

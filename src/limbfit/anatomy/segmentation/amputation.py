@@ -4,8 +4,7 @@ Bones end at the plane. Soft tissue covers them as a surgeon's flap does: the li
 plane is carried on distally and rounded off, so that the limb ends ``pad_mm`` beyond the bones.
 """
 
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import pyvista as pv
@@ -60,17 +59,17 @@ def amputate_limb(
         if parts > 1:
             labels = _divide_along(labels, axis, parts)
     height = labels.compute_heights(point, normal)
-    section = _cut_section(labels, point, normal)
+    corner, axes, section, is_whole = _cut_section(labels, point, normal)
     _check_bones(labels, height)
     array = np.where(height >= 0, labels.array, 0).astype(np.uint8)
     near = np.nonzero((height < 0) & (height > -pad_mm))
-    place = (labels.index_to_point(np.column_stack(near[::-1])) - section.corner) @ section.axes / _STEP_MM
-    depth = map_coordinates(section.depth, place.T, order=1, mode="constant", cval=0.0)
-    share = np.clip(depth / min(float(section.depth.max()), _ROUNDING * pad_mm), 0, 1)
+    place = (labels.index_to_point(np.column_stack(near[::-1])) - corner) @ axes / _STEP_MM
+    depth = map_coordinates(section, place.T, order=1, mode="constant", cval=0.0)
+    share = np.clip(depth / min(float(section.max()), _ROUNDING * pad_mm), 0, 1)
     end = pad_mm * np.sqrt(1 - (1 - share) ** 2)  # a quarter ellipse, upright at the outline
     kept = -height[near] < end
     array[tuple(axis[kept] for axis in near)] = labels.soft_value
-    _check_room(array, section, height, pad_mm)
+    _check_room(array, is_whole, height, pad_mm)
     return labels.with_array(array)
 
 
@@ -133,18 +132,12 @@ def _check_bones(labels: LabelMap, height: Array) -> None:
         )
 
 
-@dataclass(frozen=True)
-class _Section:
-    """The limb's cross-section: depth below its outline (mm, 0 outside) on a raster of the plane."""
+def _cut_section(labels: LabelMap, point: Array, normal: Array) -> tuple[Array, Array, Array, bool]:
+    """Where the plane cuts the limb; of several pieces the largest.
 
-    corner: Array
-    axes: Array
-    depth: Array
-    whole: bool
-
-
-def _cut_section(labels: LabelMap, point: Array, normal: Array) -> _Section:
-    """Where the plane cuts the limb; of several pieces the largest."""
+    Returns a corner (3,), LPS mm, and the axes (3, 2) of a raster of the plane; the depth below the outline
+    on it, mm, 0 outside; and whether the image holds all of the section.
+    """
     axes = np.linalg.svd(normal[None])[2][1:].T
     flat = (labels.index_to_point(labels.corners) - point) @ axes
     low, high = flat.min(axis=0), flat.max(axis=0)
@@ -160,11 +153,11 @@ def _cut_section(labels: LabelMap, point: Array, normal: Array) -> _Section:
     inside = find_largest_piece(inside)
     image = np.all((index > -0.5) & (index < np.array(labels.array.shape) - 0.5), axis=-1)
     rim = inside & (distance_transform_edt(image) <= 1.0)
-    return _Section(point + axes @ low, axes, distance_transform_edt(inside) * _STEP_MM, not rim.any())
+    return point + axes @ low, axes, distance_transform_edt(inside) * _STEP_MM, not rim.any()
 
 
-def _check_room(array: NDArray[np.uint8], section: _Section, height: Array, pad: float) -> None:
-    if not section.whole:
+def _check_room(array: NDArray[np.uint8], is_whole: bool, height: Array, pad: float) -> None:
+    if not is_whole:
         raise LabelError(
             "the image ends within the limb's cross-section at the amputation plane",
             remedy="move the plane proximally",
@@ -207,19 +200,13 @@ def voxelise_anatomy(anatomy: Anatomy, distal_mm: float = _MARGIN_MM) -> LabelMa
     corner = np.array([*low[:2], -size[2] * VOXEL_MM]) + VOXEL_MM / 2
     empty = np.zeros(size[::-1], dtype=np.uint8)
     grid = Grid(empty, np.full(3, VOXEL_MM), frame.to_patient(corner), frame.rotation.T)
+    array = fill_surface(anatomy.skin, grid).astype(np.uint8)
+    names = {1: SOFT_TISSUE}
     inner = {**anatomy.regions, **anatomy.bones}  # bones last: they stay whole where the two overlap
-    masks = {name: fill_surface(body, grid) for name, body in inner.items()}
-    labels = build_label_map(grid, fill_surface(anatomy.skin, grid), masks)
-    return replace(labels, regions={name: name for name in anatomy.regions})
-
-
-def build_label_map(grid: Grid, limb: Mask, bones: Mapping[str, Mask]) -> LabelMap:
-    """Labels on a grid: soft tissue where nothing but the limb is, then the bones in their order."""
-    array = limb.astype(np.uint8)
-    for value, mask in enumerate(bones.values(), start=2):
-        array[mask] = value
-    names: dict[int, str] = {1: SOFT_TISSUE, **dict(enumerate(bones, start=2))}
-    return LabelMap(array, *grid.geometry, names)
+    for value, (name, body) in enumerate(inner.items(), start=2):
+        array[fill_surface(body, grid)] = value
+        names[value] = name
+    return LabelMap(array, *grid.geometry, names, {name: name for name in anatomy.regions})
 
 
 def fill_surface(surface: Surface, grid: Grid) -> Mask:

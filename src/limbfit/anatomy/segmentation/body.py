@@ -134,19 +134,16 @@ def find_limb_mask(volume: Volume, smooth: Field) -> Mask:
     darkest = _TISSUE_SHARE * float(np.median(smooth[smooth > _compute_otsu_threshold(smooth)]))
     body = find_largest_piece(smooth > darkest)
     box = find_box(body, np.ceil(_CLOSE_MM / volume.spacing[::-1]).astype(int))
-    limb = np.zeros(body.shape, dtype=bool)
-    limb[box] = _find_outline(body[box], smooth[box], darkest, volume)
-    return limb
-
-
-def _find_outline(body: Mask, smooth: Field, darkest: float, volume: Volume) -> Mask:
-    """The limb in the box of the largest body, of what is brighter than ``darkest``."""
-    rough = find_largest_piece(remove_supports(_fill_limb(body, volume), volume))
+    smooth = smooth[box]
+    rough = find_largest_piece(remove_supports(_fill_limb(body[box], volume), volume))
     if rough.sum() * volume.voxel_mm3 < _SMALLEST_LIMB_MM3:
         raise ImageError("no limb was found in the image", remedy="check the series and its contrast")
     half = 0.5 * morphology.find_local_maximum(smooth, _RIM_MM, volume.spacing)
     core = morphology.erode_mask(rough, _RIM_MM, volume.spacing)
-    return find_largest_piece(_fill_limb(core | (rough & (smooth > np.maximum(half, darkest))), volume))
+    bright = core | (rough & (smooth > np.maximum(half, darkest)))
+    limb = np.zeros(body.shape, dtype=bool)
+    limb[box] = find_largest_piece(_fill_limb(bright, volume))
+    return limb
 
 
 def _compute_otsu_threshold(array: Field) -> float:

@@ -85,12 +85,9 @@ def compute_escape_level(levels: Field, limb: Mask) -> Field:
 def _number_cavities(marrow: Mask, smallest: float) -> NDArray[np.int32]:
     """Connected cavities of at least ``smallest`` voxels, numbered from 1."""
     found, count = connected(marrow, np.ones((3, 3, 3)))
-    sizes = np.bincount(found.ravel(), minlength=count + 1)
-    sizes[0] = 0
-    number = np.zeros(count + 1, dtype=np.int32)
-    keep = np.flatnonzero(sizes >= max(smallest, 4))
-    number[keep] = np.arange(1, len(keep) + 1)
-    return number[found]
+    keep = np.bincount(found.ravel(), minlength=count + 1) >= max(smallest, 4)
+    keep[0] = False
+    return np.where(keep, np.cumsum(keep), 0).astype(np.int32)[found]
 
 
 def _continue_cavity(
@@ -279,22 +276,19 @@ def _find_piece(
     low = np.maximum(np.round(index).astype(int) - reach, 0)[::-1]
     high = np.maximum(np.round(index).astype(int) + reach + 1, 0)[::-1]
     box = tuple(slice(a, b) for a, b in zip(low, high))
-    best, nearest = None, _NEAR_MM
-    for piece, bone in enumerate(bones):
-        inside = np.argwhere(bone[box]) + low
-        if len(inside) == 0:
-            continue
-        away = np.linalg.norm((inside[:, ::-1] - index) * grid.spacing, axis=1)
-        if away.min() <= nearest:
-            k, j, i = inside[int(away.argmin())]
-            best, nearest = ((int(k), int(j), int(i)), piece), float(away.min())
-    if best is None:
+    found = [
+        (float(np.linalg.norm((voxel[::-1] - index) * grid.spacing)), tuple(voxel.tolist()), piece)
+        for piece, bone in enumerate(bones)
+        for voxel in np.argwhere(bone[box]) + low
+    ]
+    away, voxel, piece = min(found, default=(np.inf, (0, 0, 0), 0))
+    if away > _NEAR_MM:
         place = ", ".join(f"{x:g}" for x in point)
         raise ImageError(
             f"the seed of {name!r} at ({place}) mm lies in no bone that was found",
             remedy="put it into the bone (LPS, mm), or label the bone by hand (segmentation.labels)",
         )
-    return best
+    return voxel, piece
 
 
 def _divide_piece(

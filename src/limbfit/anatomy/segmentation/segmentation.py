@@ -4,12 +4,11 @@ from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.ndimage import binary_fill_holes
 
-from ...arrays import Array, Mask
+from ...arrays import Mask
 from ...errors import ImageError
 from ..grid import BONES, DEFAULT_NAMES, FAT, LabelMap, Volume, find_proximal_end
-from ..morphology import Box, Field, compute_depth, find_box, find_largest_piece
+from ..morphology import Box, compute_depth, fill_largest_piece, find_box
 from . import body
 from .body import Contrast
 from .bones import find_bones, find_dense_bones, grow_from_seeds, name_bones
@@ -77,31 +76,18 @@ def _segment(
             "no bone was found in the limb",
             remedy="label the bones by hand and give the label map (segmentation.labels in study.toml)",
         )
-    bones = [_fill_piece(piece) for piece in pieces]
+    bones = [fill_largest_piece(piece) for piece in pieces]
     if seeds:
         bones, names = grow_from_seeds(bones, seeds, volume.crop(box))
     else:
         names = name_bones([end.order_distal_first(bone) for bone in bones], spacing)
-    fat = _find_fat(levels, limb, np.any(pieces, axis=0), ct, spacing)
-    return _build_labels(limb, fat, bones, names, volume, box)
-
-
-def _fill_piece(mask: Mask) -> Mask:
-    """The largest piece, without holes."""
-    box = find_box(mask)
-    filled = np.zeros_like(mask)
-    filled[box] = binary_fill_holes(find_largest_piece(mask[box]))
-    return filled
-
-
-def _find_fat(levels: Field, limb: Mask, bone: Mask, ct: bool, spacing: Array) -> Mask:
-    """Subcutaneous fat, by grey levels relative to muscle or, in CT, by Hounsfield units."""
-    depth = compute_depth(limb, spacing)
+    bone, depth = np.any(pieces, axis=0), compute_depth(limb, spacing)
     if ct:
         bright = (levels > body.FAT_HU[0]) & (levels < body.FAT_HU[1])
     else:
         bright = body.find_bright_fat(levels, limb, bone, depth, spacing)
-    return body.select_subcutaneous(bright, limb, bone, depth, spacing)
+    fat = body.select_subcutaneous(bright, limb, bone, depth, spacing)
+    return _build_labels(limb, fat, bones, names, volume, box)
 
 
 def _build_labels(

@@ -15,20 +15,20 @@ from dataclasses import dataclass
 
 import numpy as np
 import SimpleITK as sitk  # noqa: N813
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.ndimage import gaussian_filter, map_coordinates, spline_filter
 from scipy.optimize import least_squares
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from ...arrays import Array, Indices, Mask
+from ...arrays import Array, Mask
 from ...errors import ImageError
 from ..grid import Volume
-from ..morphology import Field, dilate_mask, erode_mask, find_box, find_local_maximum
+from ..morphology import dilate_mask, erode_mask, find_box, find_local_maximum
 from ..segmentation.body import find_limb_mask, is_ct, smooth_image
 from ..surfaces.extraction import extract_contour
 from ..surfaces.triangles import Surface
-from .sites import find_bumps, find_cap_faces, find_near_cap
+from .sites import find_bumps, find_cap
 
 _RIM_MM = 2.5  # the outline lies this near to the mask's, and at half of the brightest tissue this near
 _SPACING_MM = 3.0  # of the places where patches are fitted
@@ -60,20 +60,15 @@ def extract_marked_skin(volume: Volume) -> tuple[Surface, Mask]:
     smooth = smooth_image(volume)
     limb = find_limb_mask(volume, smooth)
     box = find_box(limb, 2 * np.ceil(_RIM_MM / volume.spacing[::-1]).astype(int) + 2)
-    contour = _extract_outline(smooth[box], limb[box], volume.spacing)
-    return Surface(volume.crop(box).index_to_point(contour.points), contour.faces).outward_surface, limb
-
-
-def _extract_outline(smooth: Field, limb: Mask, spacing: Array) -> Surface:
-    """Where the signal falls to half of the tissue beside it, near to a limb's outline, in voxels."""
-    core = erode_mask(limb, _RIM_MM, spacing)
-    half = gaussian_filter(0.5 * find_local_maximum(smooth, _RIM_MM, spacing), 1.0)
+    smooth, inside = smooth[box], limb[box]
+    # The skin is where the signal falls to half of the tissue beside it, near to the limb's outline.
+    half = gaussian_filter(0.5 * find_local_maximum(smooth, _RIM_MM, volume.spacing), 1.0)
     level = np.clip(smooth / np.maximum(half, 1e-6) - 1, -1, 1)
-    level[core] = 1.0
-    level[~dilate_mask(limb, _RIM_MM, spacing)] = -1.0
-    padded = np.pad(level, 1, constant_values=-1.0)
-    contour = extract_contour(padded, 0.0)
-    return Surface(contour.points - 1, contour.faces)
+    level[erode_mask(inside, _RIM_MM, volume.spacing)] = 1.0
+    level[~dilate_mask(inside, _RIM_MM, volume.spacing)] = -1.0
+    contour = extract_contour(np.pad(level, 1, constant_values=-1.0), 0.0)
+    skin = Surface(volume.crop(box).index_to_point(contour.points - 1), contour.faces)
+    return skin.outward_surface, limb
 
 
 def remove_markers(volume: Volume, skin: Surface) -> tuple[Volume, int]:
@@ -88,8 +83,28 @@ def remove_markers(volume: Volume, skin: Surface) -> tuple[Volume, int]:
     array = volume.array.copy()
     air = float(np.median(array[array < 0.2 * np.percentile(array, 99)]))
     normals = skin.vertex_normals
-    for bump in found:
-        _clear_marker(array, volume, skin, normals, marked, bump.feet, air)
+    for bump in found:  # what is above the patch that fits the skin around its foot
+        centre = skin.points[bump.feet].mean(axis=0)
+        distance = np.linalg.norm(skin.points - centre, axis=1)
+        foot = float(distance[bump.feet].max()) + _AROUND_MM
+        near = (distance < foot + _PATCH_MM) & (distance > foot) & ~marked
+        (frame,) = _build_frames(normals[near].mean(axis=0)[None])
+        near &= normals @ frame[2] > 0.3
+        offsets = (skin.points[near] - centre) @ frame.T
+        (coefficients,) = _fit_patches(offsets[None], np.ones((1, len(offsets)), bool))
+        reach = np.ceil((foot + _ABOVE_MM) / volume.spacing).astype(int) + 1
+        middle = np.rint(volume.point_to_index(centre)).astype(int)
+        low, high = np.maximum(middle - reach, 0), np.minimum(middle + reach + 1, volume.size)
+        box = tuple(slice(a, b) for a, b in zip(low[::-1], high[::-1], strict=True))
+        index = np.stack(np.meshgrid(*(np.arange(a, b) for a, b in zip(low, high, strict=True))), axis=-1)
+        index = index.transpose(2, 0, 1, 3)  # [k, j, i]
+        u, v, above = frame @ (volume.index_to_point(index).reshape(-1, 3) - centre).T
+        height = above - _evaluate_basis(u, v) @ coefficients
+        width = float(np.abs(volume.direction.T @ frame[2]) @ volume.spacing)
+        share = np.clip(0.5 - height / width, 0, 1)  # of voxels that the patch cuts
+        share[(np.hypot(u, v) > foot) | (height > _ABOVE_MM)] = 1.0
+        share = share.reshape(index.shape[:3])
+        array[box] = np.where(share < 1, np.minimum(array[box], air + (array[box] - air) * share), array[box])
     return volume.with_array(array), len(found)
 
 
@@ -98,7 +113,7 @@ def outline_height(skin: Surface) -> Array:
     normals = skin.vertex_normals
     cells = np.floor(skin.points / _SPACING_MM).astype(np.int64)
     places = np.unique(cells, axis=0, return_index=True)[1]
-    cap = find_near_cap(skin, find_cap_faces(skin), skin.points)
+    cap = find_cap(skin, skin.points)[1]
     places = places[~cap[places]]
     points = skin.points[places]
     tree = cKDTree(points)
@@ -145,42 +160,6 @@ def _fit_patches(offsets: Array, usable: Mask) -> Array:
         residual = offsets[..., 2] - np.einsum("nka,na->nk", design, coefficients)
         weight = usable / (1 + (residual / width) ** 2) ** 2
     return coefficients
-
-
-def _clear_marker(
-    array: NDArray[np.float32],
-    volume: Volume,
-    skin: Surface,
-    normals: Array,
-    marked: Mask,
-    feet: Indices,
-    air: float,
-) -> None:
-    """Turn a marker into air, in place: what is above the patch that fits the skin around its foot.
-
-    Voxels that the patch cuts keep their share.
-    """
-    centre = skin.points[feet].mean(axis=0)
-    distance = np.linalg.norm(skin.points - centre, axis=1)
-    foot = float(distance[feet].max()) + _AROUND_MM
-    near = (distance < foot + _PATCH_MM) & (distance > foot) & ~marked
-    (frame,) = _build_frames(normals[near].mean(axis=0)[None])
-    near &= normals @ frame[2] > 0.3
-    offsets = (skin.points[near] - centre) @ frame.T
-    (coefficients,) = _fit_patches(offsets[None], np.ones((1, len(offsets)), bool))
-    reach = np.ceil((foot + _ABOVE_MM) / volume.spacing).astype(int) + 1
-    middle = np.rint(volume.point_to_index(centre)).astype(int)
-    low, high = np.maximum(middle - reach, 0), np.minimum(middle + reach + 1, volume.size)
-    box = tuple(slice(a, b) for a, b in zip(low[::-1], high[::-1], strict=True))
-    index = np.stack(np.meshgrid(*(np.arange(a, b) for a, b in zip(low, high, strict=True))), axis=-1)
-    index = index.transpose(2, 0, 1, 3)  # [k, j, i]
-    u, v, above = frame @ (volume.index_to_point(index).reshape(-1, 3) - centre).T
-    height = above - _evaluate_basis(u, v) @ coefficients
-    width = float(np.abs(volume.direction.T @ frame[2]) @ volume.spacing)
-    share = np.clip(0.5 - height / width, 0, 1)
-    share[(np.hypot(u, v) > foot) | (height > _ABOVE_MM)] = 1.0
-    share = share.reshape(index.shape[:3])
-    array[box] = np.where(share < 1, np.minimum(array[box], air + (array[box] - air) * share), array[box])
 
 
 @dataclass(frozen=True)

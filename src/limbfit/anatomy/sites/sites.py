@@ -113,17 +113,13 @@ def _sample_faces(skin: Surface, centre: Array, width: float) -> tuple[Array, Ar
         edges = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
         close = np.linalg.norm(corners.mean(axis=1) - centre, axis=1) - edges < width
         fine.append(corners[close & (edges <= SAMPLE_EDGE_MM)])
-        corners = _split_in_four(corners[close & (edges > SAMPLE_EDGE_MM)])
+        a, b, c = np.moveaxis(corners[close & (edges > SAMPLE_EDGE_MM)], 1, 0)
+        ab, bc, ca = (a + b) / 2, (b + c) / 2, (c + a) / 2
+        quarters = [(a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)]
+        corners = np.concatenate([np.stack(quarter, axis=1) for quarter in quarters])
     corners = np.concatenate(fine)
     near = np.linalg.norm(corners.mean(axis=1) - centre, axis=1) < width
     return corners[near].mean(axis=1), cross_edges(corners[near])
-
-
-def _split_in_four(corners: Array) -> Array:
-    a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
-    ab, bc, ca = (a + b) / 2, (b + c) / 2, (c + a) / 2
-    parts = [(a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)]
-    return np.concatenate([np.stack(part, axis=1) for part in parts])
 
 
 def _normalise(vector: Array) -> Array:
@@ -162,12 +158,11 @@ def measure_tissue_under(anatomy: Anatomy, position: ArrayLike, axis: ArrayLike,
 class Marker:
     """A bump on the skin: ``position`` and unit outward ``direction`` (LPS mm) on the skin without markers.
 
-    ``height`` is its greatest height in mm, ``area`` the surface of its upper half in mm2.
+    ``height`` is its greatest height in mm.
     """
 
     position: Array
     height: float
-    area: float
     direction: Array
 
 
@@ -178,7 +173,6 @@ class Bump:
     feet: Indices
     upper: Indices
     height: float
-    area: float
 
 
 def find_markers(skin_with: Surface, skin_without: Surface) -> tuple[Marker, ...]:
@@ -188,30 +182,31 @@ def find_markers(skin_with: Surface, skin_without: Surface) -> tuple[Marker, ...
     other).
     """
     height = skin_without.signed_distance(skin_with.points)
-    cap = find_cap_faces(skin_without)
-    height[find_near_cap(skin_without, cap, skin_with.points)] = 0.0
-    areas = _compute_vertex_areas(skin_with)
+    cap, near = find_cap(skin_without, skin_with.points)
+    height[near] = 0.0
+    areas = skin_with.vertex_areas
     open_skin = Surface(skin_without.points, skin_without.faces[~cap])
     found = []
     for bump in find_bumps(skin_with, height):
         weights = areas[bump.upper] * height[bump.upper]
         position, direction = _find_foot(open_skin, skin_with.points[bump.upper], weights)
-        found.append(Marker(position, bump.height, bump.area, direction))
+        found.append(Marker(position, bump.height, direction))
     return tuple(sorted(found, key=lambda marker: -marker.height))
 
 
 def find_bumps(surface: Surface, height: Array) -> list[Bump]:
     """What stands out high and small enough for a marker; ``height`` (n,) of each vertex, mm."""
-    labels = _number_clusters(height > MIN_HEIGHT_MM / 2, surface.faces)
-    areas = _compute_vertex_areas(surface)
+    raised = height > MIN_HEIGHT_MM / 2
+    edges = find_half_edges(surface.faces)
+    clusters = number_components(edges[raised[edges].all(axis=1)], len(raised))
+    areas = surface.vertex_areas
     found = []
-    for label in range(labels.max(initial=-1) + 1):
-        feet = np.flatnonzero(labels == label)
+    for number in np.unique(clusters[raised]):
+        feet = np.flatnonzero(clusters == number)
         tallest = float(height[feet].max())
         upper = feet[height[feet] > tallest / 2]  # terraces of the skin may touch a marker's foot
-        area = float(areas[upper].sum())
-        if tallest >= MIN_HEIGHT_MM and area <= MAX_AREA_MM2:
-            found.append(Bump(feet, upper, tallest, area))
+        if tallest >= MIN_HEIGHT_MM and areas[upper].sum() <= MAX_AREA_MM2:
+            found.append(Bump(feet, upper, tallest))
     return found
 
 
@@ -265,8 +260,9 @@ def _find_foot(skin: Surface, points: Array, weights: Array) -> tuple[Array, Arr
     return foot, normal / np.linalg.norm(normal)
 
 
-def find_cap_faces(surface: Surface) -> Mask:
-    """Faces of the one plane that holds more than 3 % of a surface: the cut; skin has no such plane."""
+def find_cap(surface: Surface, points: Array) -> tuple[Mask, Mask]:
+    """Faces (m,) of the one plane that holds more than 3 % of a surface, the cut, as skin has no such plane;
+    and the points (n,) that lie beyond it or just under it."""
     normals, areas, centres = surface.face_normals, surface.face_areas, surface.triangles.mean(axis=1)
     levels = (normals * centres).sum(axis=1)
     keys = np.rint(np.column_stack([50 * normals, levels])).astype(np.int64)
@@ -274,37 +270,14 @@ def find_cap_faces(surface: Surface) -> Mask:
     group = group.ravel()
     share = np.bincount(group, weights=areas) / areas.sum()
     if share.max() < 0.03:
-        return np.zeros(len(normals), bool)
-    members = group == share.argmax()
-    normal = np.average(normals[members], axis=0, weights=areas[members])
-    normal /= np.linalg.norm(normal)
-    level = np.average(centres[members] @ normal, weights=areas[members])
-    return (normals @ normal > 0.98) & (np.abs(centres @ normal - level) < 1.0)
+        return np.zeros(len(normals), bool), np.zeros(len(points), bool)
 
+    def fit_plane(faces: Mask) -> tuple[Array, float]:
+        normal = np.average(normals[faces], axis=0, weights=areas[faces])
+        normal /= np.linalg.norm(normal)
+        return normal, np.average(centres[faces] @ normal, weights=areas[faces])
 
-def find_near_cap(surface: Surface, cap: Mask, points: Array) -> Mask:
-    """True (n,) for points beyond the plane of a surface's cap (faces of it) or just under it."""
-    if not cap.any():
-        return np.zeros(len(points), bool)
-    areas = surface.face_areas[cap]
-    normal = np.average(surface.face_normals[cap], axis=0, weights=areas)
-    normal /= np.linalg.norm(normal)
-    level = np.average(surface.triangles[cap].mean(axis=1) @ normal, weights=areas)
-    return points @ normal > level - CAP_MARGIN_MM
-
-
-def _number_clusters(raised: Mask, faces: Indices) -> Indices:
-    """Cluster number (n,) of raised vertices that share edges; -1 elsewhere."""
-    edges = find_half_edges(faces)
-    edges = edges[raised[edges].all(axis=1)]
-    component = number_components(edges, len(raised))
-    labels = np.full(len(raised), -1, np.int64)
-    if raised.any():
-        labels[raised] = np.unique(component[raised], return_inverse=True)[1]
-    return labels
-
-
-def _compute_vertex_areas(surface: Surface) -> Array:
-    areas = np.zeros(len(surface.points))
-    np.add.at(areas, surface.faces, surface.face_areas[:, None] / 3)
-    return areas
+    normal, level = fit_plane(group == share.argmax())
+    cap = (normals @ normal > 0.98) & (np.abs(centres @ normal - level) < 1.0)
+    normal, level = fit_plane(cap)
+    return cap, points @ normal > level - CAP_MARGIN_MM

@@ -11,12 +11,12 @@ import numpy as np
 import pyvista as pv
 import SimpleITK as sitk  # noqa: N813
 from numpy.typing import NDArray
-from scipy.ndimage import binary_fill_holes, gaussian_filter
+from scipy.ndimage import gaussian_filter
 
 from ...arrays import Indices, Mask
 from ...errors import LabelError
 from ..grid import Grid, LabelMap, Volume, resample_cubic
-from ..morphology import Field, compute_distance, find_box, find_largest_piece
+from ..morphology import Field, compute_distance, fill_largest_piece, find_box
 from .triangles import Surface, find_bodies, find_half_edges, from_pyvista
 
 _SIGMA_VOXELS = 0.7
@@ -55,13 +55,11 @@ def _select_body(mask: Mask, grid: Grid, name: str) -> tuple[Mask, Grid]:
     """The largest connected body without inner holes, cropped with a margin of empty voxels."""
     if not mask.any():
         raise LabelError(f"no voxel is labelled {name!r}")
-    outer = find_box(mask)
-    largest = find_largest_piece(mask[outer])
-    inner = find_box(largest)
-    body = binary_fill_holes(largest[inner])
+    body = fill_largest_piece(mask)
+    box = find_box(body)
     pad = np.ceil(_MARGIN_MM / grid.spacing).astype(int) + 2
-    padded = np.pad(body, [(p, p) for p in pad[::-1]])
-    start = np.array([a.start + b.start for a, b in zip(outer, inner)])[::-1] - pad
+    padded = np.pad(body[box], pad[::-1, None])
+    start = np.array([part.start for part in box])[::-1] - pad
     crop = Grid(padded, grid.spacing, grid.index_to_point(start), grid.direction)
     return padded, crop
 

@@ -149,7 +149,10 @@ def _read_poly(path: Path, merge: bool) -> pv.PolyData:
         with silence_vtk(), warnings.catch_warnings():
             warnings.simplefilter("ignore")
             if path.suffix.lower() == ".ply":
-                poly = _read_ply(path)
+                # By meshio: VTK's reader takes the whole process down with it when the file is cut short.
+                found = meshio.ply.read(path)  # meshio.read would print what is wrong, and end the process
+                blocks = [np.insert(b.data, 0, b.data.shape[1], axis=1).ravel() for b in found.cells]
+                poly = pv.PolyData(found.points.astype(float), np.concatenate(blocks))
             else:
                 reader = pv.get_reader(str(path))
                 if isinstance(reader, pv.STLReader):
@@ -177,13 +180,6 @@ def _check_stated_counts(path: Path) -> None:
                     remedy="export the surface again, with fewer triangles",
                 )
             rest = text[-64:]
-
-
-def _read_ply(path: Path) -> pv.PolyData:
-    """By meshio: VTK's reader takes the whole process down with it when the file is cut short."""
-    found = meshio.ply.read(path)  # meshio.read would print what is wrong, and end the process
-    faces = [np.insert(block.data, 0, block.data.shape[1], axis=1).ravel() for block in found.cells]
-    return pv.PolyData(found.points.astype(float), np.concatenate(faces))
 
 
 def _merge_points(surface: Surface) -> Surface:

@@ -132,30 +132,26 @@ def build_closed_anatomy(
 def _choose_default_cut(
     skin: RepairReport, bones: Sequence[RepairReport]
 ) -> tuple[tuple[Array, Array], tuple[str, ...]]:
-    """Point and normal below all caps at the proximal end, so that bones stick out of it; notes on it."""
-    if skin.cap is None or _compute_area(skin.cap.outline) < END_SHARE * skin.surface.area:
-        return _choose_closed_cut(skin.surface, [bone.surface for bone in bones])
-    normal, middle = skin.cap.normal, skin.cap.outline.mean(axis=0)
-    caps = [bone.cap for bone in bones if bone.cap is not None and bone.cap.normal @ normal > 0]
-    heights = [((cap.outline - middle) @ normal).min() for cap in (skin.cap, *caps)]
-    return (middle + (min(h for h in heights if h > -PROXIMAL_MM) - BELOW_MM) * normal, normal), ()
+    """Point and normal below all caps at the proximal end, so that bones stick out of it; notes on it.
 
-
-def _choose_closed_cut(
-    skin: Surface, bones: Sequence[Surface]
-) -> tuple[tuple[Array, Array], tuple[str, ...]]:
-    """The plane of a closed skin's one flat end (of several: of the one that bones reach out of), or its
-    highest (z)."""
-    ends = find_flat_ends(skin)
+    Of a closed skin it is the plane of its one flat end (of several: of the one that bones reach out of), or
+    its highest (z).
+    """
+    if skin.cap is not None and _compute_area(skin.cap.outline) >= END_SHARE * skin.surface.area:
+        normal, middle = skin.cap.normal, skin.cap.outline.mean(axis=0)
+        caps = [bone.cap for bone in bones if bone.cap is not None and bone.cap.normal @ normal > 0]
+        heights = [((cap.outline - middle) @ normal).min() for cap in (skin.cap, *caps)]
+        return (middle + (min(h for h in heights if h > -PROXIMAL_MM) - BELOW_MM) * normal, normal), ()
+    ends = find_flat_ends(skin.surface)
     beyond = [
         (point, normal)
         for point, normal in ends
-        if any(((bone.points - point) @ normal).max() > FLAT_MM for bone in bones)
+        if any(((bone.surface.points - point) @ normal).max() > FLAT_MM for bone in bones)
     ]
     up = np.array([0.0, 0.0, 1.0])
     chosen = beyond or ends
     if len(chosen) != 1 or chosen[0][1] @ up > 1.0 - 1e-6:
-        return (skin.points[:, 2].max() * up, up), ()
+        return (skin.surface.points[:, 2].max() * up, up), ()
     point, normal = chosen[0]
     place = format_place(point)
     note = f"skin: the proximal cut is its flat end at {place}, as geometry.proximal_cut does not say it"

@@ -135,7 +135,7 @@ def format_slices(
     head = ["AAOP1", "AAOP1", "Made by limbfit; no medical device", f"{_FRAME} {stated}", "END COMMENTS"]
     head += ["CYLINDRICAL", side, "0", f"{SPOKES}", f"{360.0 / SPOKES:g}", f"{len(heights)}", "0"]
     text = "\n".join([*head, *(f"{value:.3f}" for value in (*heights, *radii.ravel())), ""])
-    apart = _measure_deviations(read_slices(text)[0], samples)
+    apart = np.sqrt(close_by_fans(read_slices(text)[0]).find_nearest(samples)[0])
     if (worst := float(apart.max())) > tolerance_mm:
         raise SurfaceError(
             f"slices deviate by {worst:.2f} mm at {format_place(samples[apart.argmax()])}, more than "
@@ -143,10 +143,6 @@ def format_slices(
             remedy="give a wall's inner face, state --proximal or --body, or allow more (--tolerance-mm)",
         )
     return text, worst
-
-
-def _measure_deviations(slices: Surface, samples: Array) -> Array:
-    return np.sqrt(close_by_fans(slices).find_nearest(samples)[0])
 
 
 def _choose_slices(
@@ -163,7 +159,8 @@ def _choose_slices(
         order = np.argsort(heights)
         heights, radii = heights[order], radii[order]
         full = _fill_radii(heights, radii, angles, [local.points[loop] for loop in loops])
-        apart = _measure_deviations(_build_rings(angles[::-1], heights, full[:, ::-1]), samples)
+        rings = _build_rings(angles[::-1], heights, full[:, ::-1])
+        apart = np.sqrt(close_by_fans(rings).find_nearest(samples)[0])
         above = np.searchsorted(heights, samples[apart > tolerance / 2, 2])
         above = np.unique(above[(above > 0) & (above < len(heights))])
         low, high = heights[above - 1], heights[above]

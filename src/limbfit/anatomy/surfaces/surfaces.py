@@ -18,17 +18,11 @@ from scipy.ndimage import label as connected
 from ...arrays import Array, Indices, Mask
 from ...errors import InputError, LabelError, SurfaceError, add_location
 from ...results.limb import SurfaceMeasures, SurfacesResult
-from ..grid import Frame, LabelMap, ProximalEnd, build_limb_frame, find_proximal_end, select_layer
+from ..grid import Frame, LabelMap, ProximalEnd, build_limb_frame, find_proximal_end
 from ..morphology import find_box
 from .extraction import extract_fine_surface, extract_surface, remesh
 from .files import read_surface, write_surface
-from .triangles import (
-    Surface,
-    check_closed,
-    find_bodies,
-    find_half_edges,
-    from_pyvista,
-)
+from .triangles import Surface, check_closed, find_bodies, find_half_edges, from_pyvista
 
 ON_CUT_MM = 0.1  # nearer to the proximal cut, a point lies on it: flat ends of files are flat to half of that
 END_TOLERANCE_MM = 0.5  # a surface that ends this close to the cut is meant to be cut there
@@ -191,15 +185,12 @@ def normalise_plane(point: ArrayLike, normal: ArrayLike) -> tuple[Array, Array]:
 
 def _check_sides(limb: Mask, end: ProximalEnd) -> None:
     """Refuse a limb, distal of the cut, that a side of the image cuts off."""
-    for axis in range(3):
-        if axis == end.axis:
-            continue
-        for index in (0, -1):
-            if select_layer(limb, axis, index).sum() > 20:
-                raise LabelError(
-                    "the limb runs out of the side of the image",
-                    remedy="take an image that holds the whole limb, or move the proximal cut",
-                )
+    sides = [limb.take(index, axis=2 - axis) for axis in {0, 1, 2} - {end.axis} for index in (0, -1)]
+    if any(side.sum() > 20 for side in sides):
+        raise LabelError(
+            "the limb runs out of the side of the image",
+            remedy="take an image that holds the whole limb, or move the proximal cut",
+        )
 
 
 def cut_and_cap(surface: Surface, point: Array, normal: Array, edge_mm: float) -> Surface:
@@ -218,13 +209,9 @@ def _find_rim(surface: Surface, point: Array, normal: Array) -> Indices:
     """(n, 2) edges between the flat cap and the rest."""
     on_plane = np.abs((surface.points - point) @ normal) < _JOIN_MM
     in_cap = np.tile(on_plane[surface.faces].all(axis=1), 3)
-    edges = np.sort(find_half_edges(surface.faces), axis=1)
-    both, counts = np.unique(
-        np.concatenate([np.unique(edges[in_cap], axis=0), np.unique(edges[~in_cap], axis=0)]),
-        axis=0,
-        return_counts=True,
-    )
-    return both[counts == 2]
+    count = len(surface.points)
+    keys = np.sort(find_half_edges(surface.faces), axis=1) @ [count, 1]
+    return np.stack(np.divmod(np.intersect1d(keys[in_cap], keys[~in_cap]), count), axis=1)
 
 
 def check_anatomy(anatomy: Anatomy, files: Mapping[str, Path] | None = None) -> None:

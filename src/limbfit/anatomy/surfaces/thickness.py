@@ -42,8 +42,11 @@ def measure_fat_depth(labels: LabelMap, anatomy: Anatomy, edge_mm: float = 3.0) 
     under the fat. Raises `LabelError` when the map has no fat, or nothing but fat.
     """
     check_fat(labels)
-    core = _build_core(labels)
-    inner = extract_surface(core, None, edge_mm)
+    inside = labels.limb & ~labels.mask(FAT)  # with a thin shell of skin outside the fat, which goes
+    core = find_largest_piece(open_mask(inside, SHELL_MM, labels.spacing))
+    if not core.any():
+        raise LabelError("nothing but fat lies under the skin", remedy="correct the label 'fat'")
+    inner = extract_surface(labels.with_array(core.astype(np.uint8), {1: "core"}), None, edge_mm)
     skin = anatomy.skin
     depth = _measure_along_normals(skin, inner)
     near_cut = anatomy.height(skin.points) > -CUT_MM
@@ -53,15 +56,6 @@ def measure_fat_depth(labels: LabelMap, anatomy: Anatomy, edge_mm: float = 3.0) 
     lowered = skin.points[near_cut] - CUT_MM * anatomy.cut_normal
     depth[near_cut] = depth[below[KDTree(skin.points[below]).query(lowered)[1]]]
     return limit_slope(skin, smooth_along_surface(skin, depth, SMOOTH_MM), SLOPE)
-
-
-def _build_core(labels: LabelMap) -> LabelMap:
-    """What the subcutaneous fat encloses, as a label map of one label."""
-    inside = labels.limb & ~labels.mask(FAT)
-    opened = open_mask(inside, SHELL_MM, labels.spacing)  # a thin shell of skin outside the fat goes
-    if not opened.any():
-        raise LabelError("nothing but fat lies under the skin", remedy="correct the label 'fat'")
-    return labels.with_array(find_largest_piece(opened).astype(np.uint8), {1: "core"})
 
 
 def _measure_along_normals(skin: Surface, inner: Surface) -> Array:

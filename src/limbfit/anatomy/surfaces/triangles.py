@@ -129,6 +129,12 @@ class Surface:
         return _normalise_rows(cross_edges(self.triangles))
 
     @property
+    def vertex_areas(self) -> Array:
+        """(n,) a third of the faces around each vertex, mm2."""
+        areas = np.bincount(self.faces.ravel(), np.repeat(self.face_areas / 3, 3), len(self.points))
+        return np.asarray(areas, dtype=np.float64)
+
+    @property
     def area(self) -> float:
         """mm2."""
         return float(self.face_areas.sum())

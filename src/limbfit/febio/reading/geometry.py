@@ -12,6 +12,7 @@ from ...mesh import TET_FACES
 from ...mesh.cells import CELLS
 from .tree import XmlNode
 
+_Places = dict[int, int]  # of nodes, by FEBio's numbers
 CELL_NODES = {"tet4": 4, "tet10": 10, "hex8": 8, "penta6": 6, "tri3": 3, "tri6": 6, "quad4": 4}
 FACE_NODES = {"tri3": 3, "tri6": 6, "quad4": 4}
 # FEBio's names of an element with its quadrature, as rows of limbfit's element table.
@@ -76,17 +77,21 @@ def read_geometry(root: XmlNode, materials: Iterable[str]) -> Geometry:
     nodes = [node for group in mesh.find_all("Nodes") for node in group]
     if not nodes:
         raise mesh.error("has no nodes")
-    numbers = _NodeNumbers(nodes)
+    places: _Places = {}
+    for i, node in enumerate(nodes):
+        if places.setdefault(node.identity(), i) != i:
+            raise node.error(f"node {node.identity()} is there twice")
+    node_ids = np.array(list(places), dtype=np.int64)
     owners = _read_domains(root.child("MeshDomains"), materials)
     parts, seen = {}, set[int]()
     for name, group in _find_named(mesh, "Elements"):
         if name not in owners:
             raise group.error(f"part {name!r} has no domain, hence no material")
-        parts[name] = _read_part(group, owners[name], numbers, seen)
+        parts[name] = _read_part(group, owners[name], places, seen)
     for name, domain in owners.items():
         if name not in parts:
             raise domain.error(f"there is no part {name!r}")
-    surfaces = {name: _read_faces(group, numbers) for name, group in _find_named(mesh, "Surface")}
+    surfaces = {name: _read_faces(group, places) for name, group in _find_named(mesh, "Surface")}
     pairs = {}
     for name, pair in _find_named(mesh, "SurfacePair"):
         both = pair.string("primary"), pair.string("secondary")
@@ -94,14 +99,14 @@ def read_geometry(root: XmlNode, materials: Iterable[str]) -> Geometry:
             if surface not in surfaces:
                 raise pair.error(f"there is no surface {surface!r}")
         pairs[name] = both
-    most = len(numbers.ids)
     sets = {
-        name: np.array(numbers.look_up(group, _read_ids(group, most)), dtype=np.int64)
+        name: np.array(_find_nodes(places, group, _read_ids(group, len(places))), dtype=np.int64)
         for name, group in _find_named(mesh, "NodeSet")
     }
-    named = [group for group in mesh.find_all("Nodes") if group.attributes.get("name")]
     blocks = {
-        group.attributes["name"]: np.array(numbers.look_up(group, _read_identities(group))) for group in named
+        group.attributes["name"]: np.array([places[node.identity()] for node in group])
+        for group in mesh.find_all("Nodes")
+        if group.attributes.get("name")
     }
     elements = {name: part.ids for name, part in parts.items()}
     elements |= {name: np.array(_read_ids(group)) for name, group in _find_named(mesh, "ElementSet")}
@@ -112,24 +117,14 @@ def read_geometry(root: XmlNode, materials: Iterable[str]) -> Geometry:
         for part in lists[name]:
             if part not in parts:
                 raise group.error(f"there is no part {part!r}")
-    return Geometry(points, numbers.ids, parts, sets, elements, surfaces, pairs, blocks, lists)
+    return Geometry(points, node_ids, parts, sets, elements, surfaces, pairs, blocks, lists)
 
 
-class _NodeNumbers:
-    """FEBio's node numbers and the places of the nodes."""
-
-    def __init__(self, nodes: list[XmlNode]) -> None:
-        self.place: dict[int, int] = {}
-        for i, node in enumerate(nodes):
-            if self.place.setdefault(node.identity(), i) != i:
-                raise node.error(f"node {node.identity()} is there twice")
-        self.ids = np.array(list(self.place), dtype=np.int64)
-
-    def look_up(self, node: XmlNode, ids: list[int]) -> list[int]:
-        try:
-            return [self.place[i] for i in ids]
-        except KeyError as error:
-            raise node.error(f"there is no node {error.args[0]}") from None
+def _find_nodes(places: _Places, node: XmlNode, ids: list[int]) -> list[int]:
+    try:
+        return [places[i] for i in ids]
+    except KeyError as error:
+        raise node.error(f"there is no node {error.args[0]}") from None
 
 
 def _find_named(mesh: XmlNode, tag: str) -> list[tuple[str, XmlNode]]:
@@ -156,7 +151,7 @@ def _read_domains(section: XmlNode, materials: Iterable[str]) -> dict[str, XmlNo
     return owners
 
 
-def _read_part(group: XmlNode, domain: XmlNode, numbers: _NodeNumbers, used_ids: set[int]) -> Part:
+def _read_part(group: XmlNode, domain: XmlNode, places: _Places, used_ids: set[int]) -> Part:
     # FEBio also takes the quadrature in the place of the type: TET10G4, HEX8G8, ..
     given = group.attribute("type")
     cell_type, rule = given.lower(), domain.attributes.get("elem_type", "")
@@ -175,7 +170,7 @@ def _read_part(group: XmlNode, domain: XmlNode, numbers: _NodeNumbers, used_ids:
             raise element.error(f"element {number} has {len(corners)} nodes; {cell_type} has {count}")
         used_ids.add(number)
         ids.append(number)
-        cells.append(numbers.look_up(element, corners))
+        cells.append(_find_nodes(places, element, corners))
     if not ids:
         raise group.error("has no elements")
     formulation = _choose_formulation(domain, cell_type, rule)
@@ -199,7 +194,7 @@ def _choose_formulation(domain: XmlNode, cell_type: str, rule: str) -> str:
     return FORMULATIONS.get((cell_type, rule), "")
 
 
-def _read_faces(group: XmlNode, numbers: _NodeNumbers) -> Indices:
+def _read_faces(group: XmlNode, places: _Places) -> Indices:
     kinds = {face.tag for face in group}
     if len(kinds) != 1 or not kinds <= set(FACE_NODES):
         raise group.error(f"a surface needs faces of one type of {', '.join(FACE_NODES)}")
@@ -209,14 +204,14 @@ def _read_faces(group: XmlNode, numbers: _NodeNumbers) -> Indices:
         corners = face.integers()
         if len(corners) != count:
             raise face.error(f"has {len(corners)} nodes, not {count}")
-        faces.append(numbers.look_up(face, corners))
+        faces.append(_find_nodes(places, face, corners))
     return np.array(faces)
 
 
 def _read_ids(group: XmlNode, most: int = 10**7) -> list[int]:
     """Read the numbers of a set; a range holds at most ``most``."""
-    if group.children:  # FEBio 3: <n id="1"/>
-        return _read_identities(group)
+    if group:  # FEBio 3: <n id="1"/>
+        return [node.identity() for node in group]
     ids: list[int] = []
     for text in group.text.replace(",", " ").split():
         first, _, last = text.partition(":")
@@ -228,10 +223,6 @@ def _read_ids(group: XmlNode, most: int = 10**7) -> list[int]:
             raise group.error(f"there are no items {low} to {high}")
         ids += range(low, high + 1)
     return ids
-
-
-def _read_identities(group: XmlNode) -> list[int]:
-    return [node.identity() for node in group]
 
 
 def find_node_set(geometry: Geometry, name: str, node: XmlNode) -> Indices:

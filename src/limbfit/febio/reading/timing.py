@@ -227,15 +227,11 @@ class ControlPhase:
 
 def read_phases(root: XmlNode, curves: Mapping[int, LoadCurve]) -> tuple[ControlPhase, ...]:
     """Read the analysis steps, in order."""
-    steps = root.find("Step")
-    if steps is not None and len(steps):
-        for step in steps:
-            for child in step:
-                if child.tag not in ("Control", "Rigid"):
-                    raise child.error("only <Control> and <Rigid> may change from step to step")
-        controls = [step.child("Control") for step in steps]
-    else:
-        controls = [root.child("Control")]
+    steps = list(root.find("Step") or ())
+    for child in (child for step in steps for child in step):
+        if child.tag not in ("Control", "Rigid"):
+            raise child.error("only <Control> and <Rigid> may change from step to step")
+    controls = [step.child("Control") for step in steps] or [root.child("Control")]
     phases = tuple(_read_phase(control, curves) for control in controls)
     if sum(phase.steps for phase in phases) > MAX_STEPS:
         raise controls[0].error(f"has more than {MAX_STEPS} steps")

@@ -7,8 +7,7 @@ Nothing is ever opened but the file itself.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 from xml.parsers import expat
@@ -20,24 +19,14 @@ MAX_DEPTH = 40
 _CHUNK = 2**20
 
 
-@dataclass(slots=True)
-class XmlNode:
-    """An element of the file; ``text`` is what stands between its tags, without that of its children."""
+@dataclass(slots=True, eq=False)
+class XmlNode(list["XmlNode"]):
+    """An element of the file: the list of its children; ``text`` is what else stands between its tags."""
 
     tag: str
     attributes: dict[str, str]
     line: int
     text: str = ""
-    children: list[XmlNode] = field(default_factory=list)
-
-    def __iter__(self) -> Iterator[XmlNode]:
-        return iter(self.children)
-
-    def __getitem__(self, i: int) -> XmlNode:
-        return self.children[i]
-
-    def __len__(self) -> int:
-        return len(self.children)
 
     @property
     def place(self) -> str:
@@ -50,7 +39,7 @@ class XmlNode:
 
     def find_all(self, tag: str) -> list[XmlNode]:
         """Return the children of that name."""
-        return [child for child in self.children if child.tag == tag]
+        return [child for child in self if child.tag == tag]
 
     def find(self, tag: str) -> XmlNode | None:
         """Return the one child of that name, if there is one."""
@@ -174,7 +163,7 @@ class _TreeBuilder:
         if len(self.open) >= MAX_DEPTH:
             raise node.error(f"lies deeper than {MAX_DEPTH} elements")
         if self.open:
-            self.open[-1].children.append(node)
+            self.open[-1].append(node)
         else:
             self.root = node
         self.open.append(node)

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 from jinja2 import StrictUndefined, Template
 
-from ...anatomy.surfaces.comparison import list_circumferences
+from ...anatomy.surfaces.exchange import list_circumferences
 from ...anatomy.surfaces.files import write_surface
 from ...anatomy.surfaces.slices import format_slices
 from ...anatomy.surfaces.triangles import Surface
