@@ -95,7 +95,7 @@ def test_a_search_that_nobody_watches_is_not_repeated_where_the_force_ends_it_to
 
 @pytest.mark.parametrize("sign", [1, -1])
 def test_a_force_over_its_limit_stops_whichever_sign_its_sensor_gives(sign: int) -> None:
-    guard = Guard(make_session_limits(settings(), 60_000, 50_000, 500))
+    guard = Guard(make_session_limits(settings(), Bench().session.device.identity))
     strong = Sample(1, 2000, 0, 0, (0,) * 14, (sign * 30_000,) + (0,) * 13, (0,) * 14)
     wrong = guard.check(strong)
     assert wrong is not None

@@ -337,7 +337,7 @@ def test_errors_hold_no_traceback(page, study, monkeypatch):
     (study / "study.toml").write_text("[study]\nname = 'x'\n")
     answer = page.get("/api/study")
     assert answer.status_code == 422
-    assert "sites" in answer.json()["error"]
+    assert "give either [image] or [surfaces]" in answer.json()["error"]
     monkeypatch.setattr("limbfit.studio.study_routes.find_running", lambda folder: 1 / 0)
     answer = page.get("/api/changes")
     assert answer.status_code == 500

@@ -148,7 +148,8 @@ class Protocol:
         self._rounds = 0
         self._is_confirmed = False
         self._tare_samples: list[int] = []
-        self._contact_um: int | None = None  # where the capacitance first said so
+        self._contact_um: int | None = None  # where the capacitance first said so, or the force last did not
+        self._clear_um = 0
 
     @property
     def is_over(self) -> bool:
@@ -369,12 +370,14 @@ class Protocol:
 
     def _find_phase_after_approach(self, sample: Sample, now: float) -> Phase | None:
         pin = self.settings.pin
-        is_felt = self._compute_net_force(sample) >= to_thousandths(self.settings.touch_N) // 2
-        touches = is_felt
+        touch_mN, force_mN = to_thousandths(self.settings.touch_N), self._compute_net_force(sample)
+        touches = is_felt = force_mN >= touch_mN // 2
         if self.device.touch_fF:
             touches = sample.capacitance_fF[pin - 1] >= self.device.touch_fF
+        elif force_mN <= max(touch_mN // 10, 2 * self.guard.limits.resolution_mN):
+            self._clear_um = sample.position_um[pin - 1]
         if touches and self._contact_um is None:
-            self._contact_um = sample.position_um[pin - 1]
+            self._contact_um = sample.position_um[pin - 1] if self.device.touch_fF else self._clear_um
         if not self._is_at_rest(sample, now, (pin,)):
             return None
         if is_felt and self._contact_um is not None:

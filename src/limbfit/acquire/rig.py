@@ -209,7 +209,9 @@ class Rig:
             self._force_mN = round(1000 * self.measure_force())
         except RunError as error:
             self._trip("sensor", str(error))
+        asked = time.monotonic()
         position_um = round(1000 * self.measure_position())
+        now = (asked + time.monotonic()) / 2
         if self._move is None or abs(position_um - self._position_um) > ARRIVAL_TOLERANCE_UM / 4:
             self._moved_s = now
         self._position_um, self._number = position_um, self._number + 1

@@ -12,7 +12,8 @@ from .line_protocol import Flags, Identity, Sample, to_thousandths
 
 FROZEN_S = 0.010  # a sensor whose last digit has not changed for so long, and so many samples, is dead
 FROZEN_SAMPLES = 8
-SPEED_WINDOW_US = 10_000
+SPEED_WINDOW_US = 10_000  # over which a speed is measured; more where samples are rare
+SPEED_SAMPLES = 5
 SPEED_MARGIN = 1.25  # of a measured speed over a limit: encoder noise, and the corner of a ramp
 POSITION_MARGIN_UM = 100  # of a measured position over a limit: noise, and what braking takes
 MIN_CLAMP_MN = 500  # a clamping pin that pushes less has lost the limb
@@ -26,8 +27,9 @@ CONTACT_STEPS = 3  # of a coarse sensor: a force that is contact, and not its la
 class SafetyLimits:
     """Per pin: largest force (mN) and position (um).
 
-    For all: speed towards the limb (um/s), sensor range (mN), how often a live sensor may repeat itself, and
-    the step of a sensor that is too coarse to show its noise (mN; 0: it shows it).
+    For all: speed towards the limb (um/s), sensor range (mN), how often a live sensor may repeat itself, the
+    step of a sensor that is too coarse to show its noise (mN; 0: it shows it), and over which time (us) a
+    speed is measured.
     """
 
     force_mN: tuple[int, ...]
@@ -36,6 +38,7 @@ class SafetyLimits:
     range_mN: int
     max_unchanged_samples: int
     resolution_mN: int = 0
+    speed_window_us: int = SPEED_WINDOW_US
 
 
 @dataclass(frozen=True)
@@ -62,6 +65,7 @@ def make_session_limits(settings: AcquireTable, device: Identity, resolution_mN:
         range_mN=device.range_mN,
         max_unchanged_samples=max(round(FROZEN_S * device.rate_hz), FROZEN_SAMPLES),
         resolution_mN=resolution_mN,
+        speed_window_us=max(SPEED_WINDOW_US, SPEED_SAMPLES * 1_000_000 // device.rate_hz),
     )
 
 
@@ -108,10 +112,10 @@ class Guard:
     def _check_speeds(self, sample: Sample) -> Violation | None:
         past = self._recent_samples
         past.append(sample)
-        while len(past) > 2 and sample.time_us - past[1].time_us >= SPEED_WINDOW_US:
+        while len(past) > 2 and sample.time_us - past[1].time_us >= self.limits.speed_window_us:
             past.popleft()
         span = sample.time_us - past[0].time_us
-        if span < SPEED_WINDOW_US:
+        if span < self.limits.speed_window_us:
             return None
         most = SPEED_MARGIN * self.limits.speed_um_s * span / 1e6
         for pin, (now, then) in enumerate(zip(sample.position_um, past[0].position_um, strict=True), 1):

@@ -15,7 +15,8 @@ from limbfit.pipeline.engine.store import Store, write_json
 from limbfit.pipeline.records.records import estimate_site_noise, load_site_record
 from limbfit.pipeline.records.traces import run_traces
 from limbfit.pipeline.simulation.simulations import CURVE_POINTS
-from limbfit.report.sections.inputs import draw_record_figure, make_trace_table
+from limbfit.report.page import Table
+from limbfit.report.sections.inputs import draw_record_figure, make_record_section
 from limbfit.report.store import load_store
 
 TISSUES = ("skin", "muscle")
@@ -119,8 +120,9 @@ def test_a_protocol_goes_from_its_record_to_residuals_and_report(tmp_path, name)
     assert np.sqrt(np.diag(noise.covariance)).max() < 0.05 * peak
 
     stored = load_store(study.results)
-    figure, table = draw_record_figure(stored, name), make_trace_table(stored)
+    figure = draw_record_figure(stored, name)
     assert figure is not None
+    (table,) = (block for block in make_record_section(stored).blocks if isinstance(block, Table))
     assert f"the indenter's phases are {words}" in figure.caption
     assert words in [cell.text for cell in table.rows[0].cells]
 
