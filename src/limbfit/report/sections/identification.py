@@ -1,6 +1,5 @@
 """Parameters (table 1 of the paper), what determines them, how they were found; all sites (table 2)."""
 
-from collections import Counter
 from collections.abc import Iterable, Sequence
 from typing import Any
 
@@ -11,7 +10,7 @@ from ..drawing.pictures import draw_field_figure
 from ..formats import NOTHING, format_fixed, format_parameter
 from ..page import Block, Bullets, Cell, Note, Row, Section, Table, make_bullets
 from ..store import Results
-from ..words import make_prose, make_row, make_section, make_table, to_numeric, write_words
+from ..words import make_list, make_prose, make_row, make_section, make_table, to_numeric, write_words
 
 EQUAL_PERCENT = 0.01  # of the largest force: what the tolerance of an equilibrium leaves
 
@@ -73,12 +72,14 @@ def _describe_combinations(store: Results) -> tuple[Block | None, ...]:
 
 def make_convergence_section(store: Results) -> Section:
     """How the identification went."""
+    found = store.calibration
     return make_section(
         "convergence",
         make_bullets(write_words("end of a stage", stage=stage) for stage in store.stages),
         figures.draw_convergence_figure(store),
         draw_convergence_curves(store),
-        describe_search(store),
+        make_list("doubts", calibration=found, equal_percent=EQUAL_PERCENT) if found else None,
+        make_table("doubtful-simulations", found.doubts.search, folded=True) if found else None,
         (make_iteration_table(store, stage) for stage in store.stages if stage.iterations),
     )
 
@@ -91,24 +92,6 @@ def make_iteration_table(store: Results, stage: SearchStage) -> Table | None:
     name = f"iterations-{stage.name.replace(' ', '-')}"
     facts: dict[str, Any] = {"stage": stage, "tissues": tissues, "store": store}
     return make_table(name, stage.iterations, folded=True, words="iterations", **facts)
-
-
-def describe_search(store: Results) -> tuple[Bullets | None, Table | None]:
-    """What the record of the identification says of its doubtful simulations; nothing where none is."""
-    if store.calibration is None:
-        return None, None
-    found = store.calibration.doubts
-    rows, texts = found.search, []
-    if rows:
-        kinds = Counter(row.kind for row in rows)
-        used = sum(row.iterate is not None for row in rows)
-        texts.append(write_words("doubts of the search", found=found, kinds=kinds, used=used))
-    for site, doubts in found.answer.items():
-        texts += [f"At the answer, site {site}: {doubt.text}." for doubt in doubts]
-    for site, one in store.calibration.contact.items():
-        if (off := one.from_rest_percent or 0.0) > EQUAL_PERCENT:
-            texts.append(write_words("doubt of the answer", site=site, off=off))
-    return make_bullets(texts), make_table("doubtful-simulations", rows, folded=True)
 
 
 def make_fit_section(store: Results) -> Section:

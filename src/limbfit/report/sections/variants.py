@@ -11,9 +11,9 @@ from ...results import variants as stored
 from ..drawing.colours import GRID, INK, MEASURED, MUTED, ONE_MATERIAL, SIMULATED, THIRD, TRUTH
 from ..drawing.plots import add_legend, choose_tissue_style, make_figure, make_panels, make_standalone, styled
 from ..formats import format_fixed
-from ..page import Bullets, Figure, Section, make_bullets
+from ..page import Figure, Section
 from ..store import Results
-from ..words import make_prose, make_section, make_table, write_words
+from ..words import make_list, make_prose, make_section, make_table, write_words
 
 _COLOURS = (SIMULATED, ONE_MATERIAL, TRUTH, THIRD, MUTED, INK)
 _LINES: tuple[Any, ...] = ("-", "--", "-.", (0, (6, 2)), ":", "-")
@@ -47,7 +47,7 @@ def make_sensitivity_section(store: Results, content: stored.VariedResult, name:
         draw_figure(store, content),
         make_table(name, content.runs, marked="base", words=words, title=title, content=content),
         make_table("sensitivity-c-local", stiffness.local, content=content) if stiffness else None,
-        _list_warnings(content),
+        make_list("warnings of variants", runs=content.runs),
     )
 
 
@@ -153,14 +153,6 @@ def _draw_site_curves(store: Results, content: stored.FrictionResult | stored.In
         ax.set_ylabel("Force (N)")
     add_legend(drawing, axes[0])
     return make_figure(drawing, name, words="compared models", title=write_words(f"section {name}"))
-
-
-def _list_warnings(content: stored.VariedResult) -> Bullets | None:
-    """Simulations that did not reach their end, and what is doubtful about others."""
-    runs = content.runs
-    texts = [(row, f"stopped early: {row.reason}") for row in runs if not row.completed]
-    texts += [(row, text) for row in runs for text in row.warnings]
-    return make_bullets(f"Site {row.site}, {row.label}: {text}" for row, text in texts)
 
 
 _FIGURES: dict[str, Callable[[Results, Any], Figure]] = {  # what draws that of each experiment
