@@ -8,7 +8,7 @@ from ..drawing import figures
 from ..drawing.interactive import draw_convergence_curves
 from ..drawing.pictures import draw_field_figure
 from ..formats import NOTHING, format_fixed, format_parameter
-from ..page import Block, Bullets, Cell, Note, Row, Section, Table, make_bullets
+from ..page import Block, Cell, Note, Row, Section, Table, make_bullets
 from ..store import Results
 from ..words import make_list, make_prose, make_row, make_section, make_table, to_numeric, write_words
 
@@ -28,7 +28,8 @@ def make_parameter_section(store: Results) -> Section:
         make_correlation_table(known.correlation),
         describe_relaxation(store),
         describe_priors(store),
-        _describe_combinations(store),
+        make_prose("combinations", found=known),
+        make_list("list of combinations", found=known, store=store),
         make_prose("residuals", found=known.residuals),
     )
 
@@ -58,16 +59,6 @@ def describe_priors(store: Results) -> tuple[Block | None, ...]:
     if found is None:
         return ()
     return make_prose("priors", found=found), make_table("priors", store.parameters, store=store, found=found)
-
-
-def _describe_combinations(store: Results) -> tuple[Block | None, ...]:
-    """What the data determine of several parameters together, best determined first."""
-    sentences = list(store.uncertainty.combinations) if store.uncertainty else []
-    if not sentences:
-        return ()
-    for name in map(".".join, store.parameters):
-        sentences = [sentence.replace(name, format_parameter(name)) for sentence in sentences]
-    return make_prose("combinations"), Bullets(tuple(sentences))
 
 
 def make_convergence_section(store: Results) -> Section:
@@ -100,9 +91,7 @@ def make_fit_section(store: Results) -> Section:
     return make_section(
         "fit",
         figures.draw_force_figure(store, rows, "time_s", "forces-fitted", 2),
-        figures.draw_layer_figure(store, fitted=True),
-        figures.draw_wave_figure(store, fitted=True),
-        figures.draw_skin_figure(store, fitted=True),
+        figures.draw_seen_figures(store, fitted=True),
         draw_field_figure(store, store.fitted[:4], "predict", "field"),
     )
 
@@ -119,9 +108,7 @@ def make_prediction_section(store: Results) -> Section:
         figures.draw_error_figure(store),
         figures.draw_force_figure(store, rows, "time_s", "forces-held-out", 3),
         figures.draw_force_figure(store, rows, "displacement_mm", "loops-held-out", 3),
-        figures.draw_layer_figure(store, fitted=False),
-        figures.draw_wave_figure(store, fitted=False),
-        figures.draw_skin_figure(store, fitted=False),
+        figures.draw_seen_figures(store, fitted=False),
         make_observed_table(store),
         Note(write_words("unseen")) if store.predicted and not rows else None,
     )

@@ -29,15 +29,9 @@ def make_method_section(store: Results) -> Section:
 def write_method_markdown(store: Results) -> str:
     """The same as Markdown, with every setting as a table at its end."""
     name = store.run.study.name if store.run else "Unnamed study"
-    lines = [f"# Methods: {name}", ""]
-    for head, text in write_method_parts(store):
-        lines += [f"## {head}", "", text, ""]
     settings = flatten_settings(store.run.settings if store.run else {})
-    if settings:
-        lines += ["## Every setting", "", "| key | value |", "|---|---|"]
-        cells = ([text.replace("|", "\\|").replace("\n", " ") for text in pair] for pair in settings.items())
-        lines += [f"| {key} | {value} |" for key, value in cells]
-    return "\n".join(lines) + "\n"
+    template = make_environment().get_template("methods.md.j2")
+    return template.render(name=name, parts=write_method_parts(store), settings=settings)
 
 
 def write_method_parts(store: Results) -> tuple[Part, ...]:
