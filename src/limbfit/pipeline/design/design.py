@@ -133,10 +133,7 @@ def _build_candidate_models(
 
 
 def _choose_designs(
-    context: Context,
-    found: Sequence[tuple[Candidate, float]],
-    sites: int,
-    left_out: list[str],
+    context: Context, found: Sequence[tuple[Candidate, float]], sites: int, left_out: list[str]
 ) -> dict[str, Any]:
     """The best choices, the study's own, all sites, and the candidates."""
     study = context.study

@@ -161,10 +161,7 @@ def correct_answer(
 
 
 def _estimate_mesh_errors(
-    simulator: RecordSimulator,
-    parameters: Array,
-    searched: Responses,
-    others: Sequence[SiteRecord | None],
+    simulator: RecordSimulator, parameters: Array, searched: Responses, others: Sequence[SiteRecord | None]
 ) -> tuple[Array, ...]:
     """One standard deviation (n,) N of what the study's meshes lack at every site.
 
@@ -223,10 +220,7 @@ def estimate_linearised(
 
 
 def sample_intervals(
-    simulator: RecordSimulator,
-    found: Calibration,
-    correction: FineMeshCorrection,
-    moves: bool = True,
+    simulator: RecordSimulator, found: Calibration, correction: FineMeshCorrection, moves: bool = True
 ) -> tuple[Calibration, Uncertainty]:
     """The answer, which ``moves`` to what is most probable where that is wanted, and what is known of it.
 

@@ -13,12 +13,7 @@ from ...arrays import Array
 from ...identify.fit.multifidelity import MeshCorrection
 from ...identify.fit.objective import SiteResponse
 from ...identify.fit.parameters import build_space
-from ...identify.fit.prediction import (
-    NORMAL_95,
-    RelaxationSpread,
-    compute_force_range,
-    compute_half_width_95,
-)
+from ...identify.fit.prediction import NORMAL_95, RelaxationSpread, compute_force_range, compute_half_width_95
 from ...identify.uncertainty.likelihood import Likelihood, compare_models, fit_alternative
 from ...identify.uncertainty.posterior import Exploration, ExplorationSettings, explore_posterior
 from ...identify.uncertainty.relaxation import limit_verdicts
@@ -370,9 +365,7 @@ def _write_prediction(
     inside = (measured >= low) & (measured <= high)
     facts |= {_SHARES[k]: 100 * float(np.sqrt(v.mean())) / peak for k, v in variances.items()}
     return stored.IntervalParts(
-        **facts,
-        inside_percent=100 * float(inside.mean()),
-        half_width_percent=100 * half_width / peak,
+        **facts, inside_percent=100 * float(inside.mean()), half_width_percent=100 * half_width / peak
     )
 
 

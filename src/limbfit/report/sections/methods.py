@@ -38,8 +38,7 @@ def write_method_parts(store: Results) -> tuple[Part, ...]:
     """Heading and paragraph of every part of which something is stored."""
     # Prose, not HTML: the page escapes it.
     environment = make_environment(
-        ChainableUndefined,
-        finalize=lambda value: NOTHING if isinstance(value, ChainableUndefined) else value,
+        ChainableUndefined, finalize=lambda value: NOTHING if isinstance(value, ChainableUndefined) else value
     )
     text = environment.get_template("methods.j2").render(
         store=store,

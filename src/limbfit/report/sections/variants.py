@@ -21,13 +21,7 @@ _STYLES = tuple(zip(_COLOURS, _LINES, strict=True))
 _RANGE = ("J_min", "J_low", "J_high", "J_max")
 KINDS = {"skin": "Figure 8. Skin, adipose tissue", "muscle": "Figure 9. Muscle, soft tissue below the skin"}
 _OWN = ((SIMULATED, "-"), (THIRD, "-"), (INK, "-"))
-_OTHERS = (
-    (ONE_MATERIAL, "--"),
-    (TRUTH, "-."),
-    (THIRD, (0, (6, 2))),
-    (MUTED, ":"),
-    (MEASURED, (0, (1, 2))),
-)
+_OTHERS = ((ONE_MATERIAL, "--"), (TRUTH, "-."), (THIRD, (0, (6, 2))), (MUTED, ":"), (MEASURED, (0, (1, 2))))
 
 
 def make_sensitivity_section(store: Results, content: stored.VariedResult, name: str) -> Section:
