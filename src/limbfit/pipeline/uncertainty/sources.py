@@ -33,11 +33,12 @@ MORE_STEPS = 2
 
 
 @dataclass(frozen=True)
-class SourceVariant:
-    """A changed model of every fitted site, as ``jobs``.
+class Change:
+    """A changed model of every fitted site, as ``jobs``, and what it does.
 
     ``shared``: the change is the same at all sites, or each site has its own. ``counted``: it is a spread
     that enters the covariance, or an alternative that is only told. ``scale``: of the difference of forces.
+    Once simulated, ``force_N`` are the changes of force (n,) N at the sites, zero at those that ``failed``.
     """
 
     source: str
@@ -46,20 +47,13 @@ class SourceVariant:
     shared: bool
     counted: bool
     scale: float = 1.0
+    force_N: tuple[Array, ...] = ()
+    failed: tuple[str, ...] = ()
 
     @property
     def sites(self) -> tuple[str, ...]:
         """The site of each job: what is a site's own is the same for all its records."""
         return tuple(job.model.site for job in self.jobs)
-
-
-@dataclass(frozen=True)
-class Change:
-    """What a variant does: change of force (n,) N at every fitted site; zero at those that ``failed``."""
-
-    variant: SourceVariant
-    force_N: tuple[Array, ...]
-    failed: tuple[str, ...]
 
 
 def simulate_sources(
@@ -87,7 +81,7 @@ def simulate_sources(
                 differences.append(np.zeros(len(record.compared)))
             else:
                 differences.append(variant.scale * (new - old))
-        found.append(Change(variant, tuple(differences), tuple(failed)))
+        found.append(replace(variant, force_N=tuple(differences), failed=tuple(failed)))
     return found
 
 
@@ -104,15 +98,15 @@ def _build_variants(
     records: RecordSet,
     plain: Sequence[SimulationJob],
     models: Sequence[SiteModel],
-) -> list[SourceVariant]:
+) -> list[Change]:
     """All variants of the study, of ``models`` that hold their contact penalties; their meshes are made."""
-    study, table, found = context.study, context.study.uncertainty, list[SourceVariant]()
+    study, table, found = context.study, context.study.uncertainty, list[Change]()
 
     def add(
         source: str, change: str, changed: Sequence[SiteModel], shared: bool, counted: bool, scale: float = 1
     ) -> None:
         jobs = tuple(replace(job, model=model) for job, model in zip(plain, changed, strict=True))
-        found.append(SourceVariant(source, change, jobs, shared, counted, scale))
+        found.append(Change(source, change, jobs, shared, counted, scale))
 
     thicker = _thicken_layer(context, folder, models)
     add("layer thickness", f"{table.layer_mm:g} mm thicker", thicker, True, True)

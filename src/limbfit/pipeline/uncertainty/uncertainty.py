@@ -153,13 +153,12 @@ class Findings:
 
     def compute_covariance(self, change: Change) -> Array:
         """Of the logarithms (p, p), by one source."""
-        variant = change.variant
-        return self.gain.compute_covariance(change.force_N, variant.shared, variant.sites)
+        return self.gain.compute_covariance(change.force_N, change.shared, change.sites)
 
     @property
     def source_covariance(self) -> Array:
         """Of the logarithms (p, p), by all counted sources."""
-        parts = [self.compute_covariance(change) for change in self.changes if change.variant.counted]
+        parts = [self.compute_covariance(change) for change in self.changes if change.counted]
         return np.sum([np.zeros_like(self.known.covariance), *parts], axis=0)
 
 
@@ -294,18 +293,18 @@ def _summarise_source(found: Findings, change: Change) -> stored.SourceEffect:
 
     A source of each site's own changes parameters by the root of the sum of squares over sites.
     """
-    variant, model = change.variant, found.known.residual_model
+    model = found.known.residual_model
     names = [noise.name for noise in model.noise]
     forces = [100 * float(np.mean(np.abs(d))) / peak for d, peak in zip(change.force_N, model.peaks_N)]
-    if variant.shared:
+    if change.shared:
         shift = found.gain.compute_shift(change.force_N)
     else:
         shift = np.sqrt(np.diag(found.compute_covariance(change)))
     return stored.SourceEffect(
-        source=variant.source,
-        change=variant.change,
-        shared=variant.shared,
-        counted=variant.counted,
+        source=change.source,
+        change=change.change,
+        shared=change.shared,
+        counted=change.counted,
         failed=change.failed,
         force_percent=dict(zip(names, forces)),
         parameters_percent=dict(zip(found.known.names, (100 * np.expm1(shift)).tolist())),
@@ -396,12 +395,11 @@ def _describe_verdict(
         )
     if found.evidence is not None:
         words.append(found.evidence.verdict[0].upper() + found.evidence.verdict[1:] + ".")
-    counted = [change for change in found.changes if change.variant.counted]
+    counted = [change for change in found.changes if change.counted]
     if counted:
         largest = max(counted, key=lambda change: float(np.trace(found.compute_covariance(change))))
         words.append(
-            f"Beyond the records, {largest.variant.source} ({largest.variant.change}) would change the "
-            "parameters most."
+            f"Beyond the records, {largest.source} ({largest.change}) would change the parameters most."
         )
     coverage = predictions.coverage_heldout_percent
     if coverage is not None:
