@@ -1,16 +1,15 @@
 """Parameters (table 1 of the paper), what determines them, how they were found; all sites (table 2)."""
 
-from collections.abc import Iterable, Sequence
 from typing import Any
 
-from ...results.identification import CorrelationMatrix, RecordPrediction, SearchStage, average_records
+from ...results.identification import CorrelationMatrix, SearchStage, average_records
 from ..drawing import figures
 from ..drawing.interactive import draw_convergence_curves
 from ..drawing.pictures import draw_field_figure
-from ..formats import NOTHING, format_fixed, format_parameter
-from ..page import Block, Cell, Note, Row, Section, Table, make_bullets
+from ..formats import format_fixed, format_parameter
+from ..page import Cell, Note, Section, Table, make_bullets
 from ..store import Results
-from ..words import make_list, make_prose, make_row, make_section, make_table, to_numeric, write_words
+from ..words import make_list, make_prose, make_row, make_section, make_table, write_words
 
 EQUAL_PERCENT = 0.01  # of the largest force: what the tolerance of an equilibrium leaves
 
@@ -20,14 +19,16 @@ def make_parameter_section(store: Results) -> Section:
     known = store.uncertainty
     if known is None:
         return make_section("parameters")
-    truth = store.truth.get("parameters", {})
+    truth, relaxation, priors = store.truth.get("parameters", {}), known.relaxation, known.priors
     return make_section(
         "parameters",
         make_table("parameters", store.parameters, store=store, known=known, truth=truth),
         figures.draw_interval_figure(store),
         make_correlation_table(known.correlation),
-        describe_relaxation(store),
-        describe_priors(store),
+        make_prose("relaxation", found=relaxation) if relaxation else None,
+        make_table("moduli", relaxation.moduli, store=store) if relaxation else None,
+        make_prose("priors", found=priors) if priors else None,
+        make_table("priors", store.parameters, store=store, found=priors) if priors else None,
         make_prose("combinations", found=known),
         make_list("list of combinations", found=known, store=store),
         make_prose("residuals", found=known.residuals),
@@ -43,22 +44,6 @@ def make_correlation_table(correlation: CorrelationMatrix) -> Table:
         cells = [Cell(format_fixed(r, 2), number=True, shade=max(-1.0, min(1.0, r))) for r in values]
         rows.append(make_row(head, *cells))
     return Table("correlation", write_words("table correlation"), ("", *heads), tuple(rows))
-
-
-def describe_relaxation(store: Results) -> tuple[Block | None, ...]:
-    """What the records tell of relaxation, and the modulus of each tissue at several times after a step."""
-    found = store.uncertainty.relaxation if store.uncertainty else None
-    if found is None:
-        return ()
-    return make_prose("relaxation", found=found), make_table("moduli", found.moduli, store=store)
-
-
-def describe_priors(store: Results) -> tuple[Block | None, ...]:
-    """Each parameter's prior, how much of its variance priors cause, and its interval without them."""
-    found = store.uncertainty.priors if store.uncertainty else None
-    if found is None:
-        return ()
-    return make_prose("priors", found=found), make_table("priors", store.parameters, store=store, found=found)
 
 
 def make_convergence_section(store: Results) -> Section:
@@ -136,25 +121,14 @@ def make_domain_section(store: Results) -> Section:
 def make_site_table(store: Results) -> Table | None:
     """Table 2: largest force and errors of each site, fitted sites marked."""
     several = len({row.site for row in store.predicted}) < len(store.predicted)
-    foot = _make_mean_rows(store)
+    means = []
+    for use, fitted in (("fitted", True), ("held out", False)):
+        if chosen := [row for row in store.predicted if row.fitted == fitted]:
+            one = average_records((row.site, row.error_one_material_percent) for row in chosen)
+            means.append((use, chosen, one, average_records((row.site, row.error_percent) for row in chosen)))
+    last = make_table("site-means", means, store=store)
+    foot = last.rows if last else ()
     return make_table("sites", store.predicted, marked="fitted", foot=foot, several=several, store=store)
-
-
-def _make_mean_rows(store: Results) -> Iterable[Row]:
-    for fitted, use, key in ((True, "fitted", "fitted"), (False, "held out", "heldout")):
-        chosen = [row for row in store.predicted if row.fitted == fitted]
-        one = average_records((row.site, row.error_one_material_percent) for row in chosen)
-        if chosen:
-            mean = to_numeric(format_fixed(sum(one) / len(one)) if one else NOTHING)
-            cells = (_count_sites(chosen), use, to_numeric(""), to_numeric(""), mean)
-            yield make_row(f"Mean, {use}", *cells, to_numeric(store.mean_error(key)))
-
-
-def _count_sites(rows: Sequence[RecordPrediction]) -> str:
-    """How many sites, and how many of them the mean lacks."""
-    sites = len({row.site for row in rows})
-    lacking = sites - len(average_records((row.site, row.error_percent) for row in rows))
-    return f"{sites} site{'s' if sites > 1 else ''}" + (f", without {lacking}" if lacking else "")
 
 
 def make_observed_table(store: Results) -> Table | None:

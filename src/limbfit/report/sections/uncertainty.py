@@ -15,7 +15,7 @@ from ..drawing.figures import draw_forces
 from ..formats import format_fixed, format_parameter, format_with_unit
 from ..page import Bullets, Figure, Note, Prose, Section, Table, make_bullets
 from ..store import Curves, Results, find_compared_quantity
-from ..words import make_prose, make_row, make_section, make_table, to_numeric, write_words
+from ..words import make_prose, make_section, make_table, write_words
 
 TrueValues = dict[str, tuple[float, dict[str, Any]]]  # by name: a true parameter and its line
 MAX_DRAWS, MAX_SITES, MAX_PANELS = 300, 18, 4
@@ -254,13 +254,8 @@ def make_error_table(store: Results, content: stored.RegionsResult) -> Table | N
         return (facts.site if facts else record) in region.fitted_sites
 
     rows = [(region, record) for region in content.regions for record in region.own_error_percent_by_site]
-    foot = []
-    for region in content.regions:
-        errors = region.own_error_percent, region.whole_error_percent
-        means = (to_numeric(format_fixed(error, 2)) for error in errors)
-        number_of_sites = f"{len(region.sites)} site{'s' if len(region.sites) > 1 else ''}"
-        end = "" if region.converged else "not converged"
-        foot.append(make_row(f"Mean, {region.region}", number_of_sites, end, *means))
+    means = make_table("region-means", content.regions)
+    foot = means.rows if means else ()
     return make_table("region-errors", rows, marked=is_fitted, foot=foot, is_fitted=is_fitted)
 
 

@@ -28,15 +28,12 @@ def make_sensitivity_section(store: Results, content: stored.VariedResult, name:
     """Force with one thing changed at a time: in words, in curves, and in a table of the simulations."""
     draw_figure = _FIGURES[name]
     stiffness = content if isinstance(content, stored.StiffnessResult) else None
-    facts = {
-        "element": store.calibration.element if store.calibration else None,
-        "changes": write_words("changes of the force", runs=content.runs),
-    }
+    element = store.calibration.element if store.calibration else None
     title = write_words(f"section {name}")
     words = "compared models" if draw_figure is _draw_site_curves else ""
     return make_section(
         name,
-        make_prose(name, content=content, **facts),
+        make_prose(name, content=content, element=element),
         make_prose("leading tissues", found=_find_leading_tissues(stiffness)) if stiffness else None,
         draw_figure(store, content),
         make_table(name, content.runs, marked="base", words=words, title=title, content=content),
