@@ -18,7 +18,7 @@ from ...anatomy.sites.sites import compute_indenter_axis
 from ...anatomy.surfaces.surfaces import load_anatomy
 from ...arrays import Array
 from ...fe import ORDER_IN_TIME
-from ...indentation import Simulation, SimulationJob, SiteModel, to_vector3
+from ...indentation import SimulationJob, SiteModel, to_vector3
 from ...shapes import SHAPES
 from ...study import Study
 from ..engine.context import Context
@@ -62,7 +62,12 @@ def simulate_sources(
     """Simulate all variants of the study, on the meshes of the search, and the records as they are."""
     plain = [record.job(parameters, sensitivities=False) for record in records.searched]
     answers = list(cache.run(plain, context.executor))
-    models = [_hold_penalty(job.model, answer) for job, answer in zip(plain, answers, strict=True)]
+    # With the contact penalty of its simulation no source is mistaken for another penalty, and none is
+    # searched for each variant by a simulation of its own.
+    models = []
+    for job, done in zip(plain, answers, strict=True):
+        held = job.model.steps.model_copy(update={"penalty_per_mm": done.facts.get("penalty_per_mm")})
+        models.append(replace(job.model, steps=held))
     variants = _build_variants(context, folder, records, plain, models)
     jobs = [job for variant in variants for job in variant.jobs]
     total = len(plain) + len(jobs)
@@ -83,13 +88,6 @@ def simulate_sources(
                 differences.append(variant.scale * (new - old))
         found.append(replace(variant, force_N=tuple(differences), failed=tuple(failed)))
     return found
-
-
-def _hold_penalty(model: SiteModel, answer: Simulation) -> SiteModel:
-    """The model with the contact penalty of its simulation: no source is mistaken for another penalty, and
-    none is searched for each variant by a simulation of its own."""
-    held = {"penalty_per_mm": answer.facts.get("penalty_per_mm")}
-    return replace(model, steps=model.steps.model_copy(update=held))
 
 
 def _build_variants(
@@ -114,8 +112,13 @@ def _build_variants(
     for number, word in directions:
         moved = [_move_site(context, model, number, table.position_mm) for model in models]
         add("site position", f"{table.position_mm:g} mm {word}", moved, False, True)
+    angle = np.radians(table.axis_degrees)
     for number, word in directions:
-        tilted = [_rotate_axis(model, number, table.axis_degrees) for model in models]
+        tilted = []
+        for model in models:
+            axis = np.array(model.axis)
+            off = np.cos(angle) * axis + np.sin(angle) * _build_tangents(axis)[number]
+            tilted.append(replace(model, axis=to_vector3(off)))
         add("site axis", f"{table.axis_degrees:g} degrees {word}", tilted, False, True)
     radius, doubted = table.edge_radius_mm, [SHAPES[m.indenter.shape].is_edge_doubted for m in models]
     if radius > 0 and any(doubted):
@@ -160,12 +163,6 @@ def _build_tangents(axis: Array) -> tuple[Array, Array]:
     along = up - (up @ axis) * axis
     along /= np.linalg.norm(along)
     return along, np.cross(axis, along)
-
-
-def _rotate_axis(model: SiteModel, number: int, degrees: float) -> SiteModel:
-    axis, angle = np.array(model.axis), np.radians(degrees)
-    tilted = np.cos(angle) * axis + np.sin(angle) * _build_tangents(axis)[number]
-    return replace(model, axis=to_vector3(tilted))
 
 
 def _move_site(context: Context, model: SiteModel, number: int, distance_mm: float) -> SiteModel:

@@ -437,22 +437,17 @@ def _describe_profiles(explored: Exploration) -> list[str]:
 
 
 def _write_flat(file: Path, rows: Sequence[ResultPart]) -> None:
-    """Rows of one kind as CSV, their lists and dictionaries as columns."""
-    flat = [_flatten_row(row) for row in rows]
+    """Rows of one kind as CSV, their lists and dictionaries as columns; what is None has none."""
+    flat = []
+    for row in rows:
+        cells: dict[str, Any] = {}
+        for key, value in row.to_plain().items():
+            if isinstance(value, dict):
+                cells |= {f"{key}.{name}": number for name, number in value.items()}
+            elif isinstance(value, list) and len(value) == 2 and not isinstance(value[0], str):
+                cells |= {f"{key}_low": value[0], f"{key}_high": value[1]}
+            elif value is not None:
+                cells[key] = " ".join(map(str, value)) if isinstance(value, list) else value
+        flat.append(cells)
     fullest: dict[str, Any] = max(flat, key=len, default={})  # a row without an interval lacks its columns
     write_table(file, list(fullest), [[row.get(head) for head in fullest] for row in flat])
-
-
-def _flatten_row(row: ResultPart) -> dict[str, Any]:
-    """Lists and dictionaries of a row as columns; what is None has none."""
-    flat: dict[str, Any] = {}
-    for key, value in row.to_plain().items():
-        if isinstance(value, dict):
-            flat |= {f"{key}.{name}": number for name, number in value.items()}
-        elif isinstance(value, list) and len(value) == 2 and not isinstance(value[0], str):
-            flat |= {f"{key}_low": value[0], f"{key}_high": value[1]}
-        elif isinstance(value, list):
-            flat[key] = " ".join(map(str, value))
-        elif value is not None:
-            flat[key] = value
-    return flat
