@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from stored_results import write_results
 
-from limbfit.report.drawing.figures import draw_layer_figure, draw_skin_figure, draw_wave_figure
+from limbfit.report.drawing.figures import draw_seen_figures
 from limbfit.report.sections.identification import (
     make_fit_section,
     make_observed_table,
@@ -89,8 +89,8 @@ def _write(file: Path, columns: dict[str, np.ndarray]) -> None:
 
 def test_each_kind_is_drawn_where_it_belongs(results: Path) -> None:
     store = load_store(results)
-    surface, layer = draw_skin_figure(store, fitted=True), draw_layer_figure(store, fitted=False)
-    wave = draw_wave_figure(store, fitted=False)
+    surface, layer = draw_seen_figures(store, fitted=True)[2], draw_seen_figures(store, fitted=False)[0]
+    wave = draw_seen_figures(store, fitted=False)[1]
     assert surface is not None
     assert layer is not None
     assert wave is not None
@@ -100,8 +100,8 @@ def test_each_kind_is_drawn_where_it_belongs(results: Path) -> None:
     assert surface.name == "surface-fitted"
     assert "PT-1: 2.2 %" in surface.markup
     assert "TI-5, muscle" in layer.markup
-    assert draw_skin_figure(store, fitted=False) is None
-    assert draw_layer_figure(store, fitted=True) is None
+    assert draw_seen_figures(store, fitted=False)[2] is None
+    assert draw_seen_figures(store, fitted=True)[0] is None
     assert surface in make_fit_section(store).blocks
     assert layer in make_prediction_section(store).blocks
 
@@ -122,4 +122,4 @@ def test_each_has_a_row_with_what_was_left_out(results: Path) -> None:
 def test_a_study_of_forces_alone_shows_nothing_of_it(tmp_path: Path) -> None:
     store = load_store(write_results(tmp_path / "results", geometry=False))
     assert make_observed_table(store) is None
-    assert draw_skin_figure(store, fitted=True) is None
+    assert draw_seen_figures(store, fitted=True)[2] is None

@@ -1,5 +1,7 @@
 """Intervals of a socket's results: what they come from, against drawn parameters; doubts in its words."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -23,7 +25,7 @@ def spread_of(
     off=(0.0, 0.0), shift=(0.0, 0.0), relaxation=((0.0, 0.0), (0.0, 0.0)), fall=(0.0, 0.0)
 ) -> SimulationSpread:
     known = ParameterSpread(COVARIANCE, np.array(off))
-    worn = known.relax(1.0, np.array(shift), np.array(relaxation), np.array(fall))
+    worn = replace(known, shift=np.array(shift), relaxation=np.array(relaxation), fall=np.array(fall))
     return SimulationSpread(NAMES, (0, 1), worn)
 
 

@@ -121,27 +121,22 @@ class Bodies:
         self.levers = np.zeros((first, 3, column))
         frames = [np.broadcast_to(b.frame, (b.surface.areas.size, 3, 3)) for b in self.all]
         self.frames = np.concatenate(frames or [np.zeros((0, 3, 3))])
-        shares = [self._build_shares(body.surface) for body in self.all]
+        shares = []  # (unknowns, 3 c) of the unknowns in the position of every contact point
+        for body in self.all:
+            whole = sp.kron(body.surface.shares, sp.eye(3), format="csr")
+            own = whole[np.flatnonzero(pattern.numbers[: self.nodes].ravel() >= 0)]
+            own.resize(self.unknowns, whole.shape[1])  # the coordinates of bodies are the last unknowns
+            shares.append(own)
         self._spread = sp.hstack(shares or [sp.csr_matrix((self.unknowns, 0))], format="csr")
         self._positions = [find_positions(b.surface.faces, pattern.numbers, pattern.indptr, pattern.indices)
                            for b in self.all]  # fmt: skip
-        self._locate_border()
-
-    def _build_shares(self, surface: ContactSurface) -> sp.csr_matrix:
-        """Shares (unknowns, 3 c) of the unknowns in the position of every contact point."""
-        whole = sp.kron(surface.shares, sp.eye(3), format="csr")
-        own = whole[np.flatnonzero(self.pattern.numbers[: self.nodes].ravel() >= 0)]
-        own.resize(self.unknowns, whole.shape[1])  # the coordinates of bodies are the last unknowns
-        return own
-
-    def _locate_border(self) -> None:
-        """Where the entries of the bodies' coordinates are in the matrix."""
-        start = self.unknowns - self.free
-        places = np.flatnonzero(self.pattern.indices >= start)
-        rows = np.searchsorted(self.pattern.indptr, places, side="right") - 1
-        columns, above = self.pattern.indices[places] - start, rows < start
+        # Where the entries of the bodies' coordinates are in the matrix.
+        border = self.unknowns - self.free
+        places = np.flatnonzero(pattern.indices >= border)
+        rows = np.searchsorted(pattern.indptr, places, side="right") - 1
+        columns, above = pattern.indices[places] - border, rows < border
         self._beside = rows[above], columns[above], places[above]
-        self._corner = rows[~above] - start, columns[~above], places[~above]
+        self._corner = rows[~above] - border, columns[~above], places[~above]
 
     @property
     def first_body(self) -> _Body:

@@ -129,7 +129,10 @@ class System:
         if problem.prestretch is not None:
             self._apply_prestretch(np.asarray(problem.prestretch, dtype=float))
         self._number_unknowns(problem)
-        self._build_pattern(problem)
+        moved = [np.unique(body.faces) for body in problem.rigid_bodies if body.motion.free.any()]
+        graph = append_rows(build_node_graph(self.cells, self.nodes), moved)
+        self.indptr, self.indices = build_upper_pattern(self.numbers, graph)
+        self.cell_positions = find_positions(self.cells, self.numbers, self.indptr, self.indices)
         pattern = Pattern(self.indptr, self.indices, self.numbers)
         self.pressures = Pressures(self.element, self.points, problem.pressures, pattern)
         self.bodies = Bodies(problem, self.element, self.points, pattern)
@@ -172,12 +175,6 @@ class System:
         self.numbers.ravel()[self.free] = np.arange(len(self.free), dtype=np.int32)
         if not len(self.free):
             raise ProblemError("every node is held: nothing is left to solve")
-
-    def _build_pattern(self, problem: Problem) -> None:
-        moved = [np.unique(body.faces) for body in problem.rigid_bodies if body.motion.free.any()]
-        graph = append_rows(build_node_graph(self.cells, self.nodes), moved)
-        self.indptr, self.indices = build_upper_pattern(self.numbers, graph)
-        self.cell_positions = find_positions(self.cells, self.numbers, self.indptr, self.indices)
 
     @property
     def unknowns(self) -> int:

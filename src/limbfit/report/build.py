@@ -53,14 +53,19 @@ def write_page(page: Page, out: Path) -> Path:
 def _write_parts(page: Page, folder: Path) -> None:
     """``tables/<name>.csv`` and ``.json``, ``figures/<name>.svg``, for every table and drawing of a page.
 
-    Numbers are those of the page, as rounded there; a figure that is a photograph is left out.
+    Numbers are those of the page, as rounded there; what the page marks (fitted sites, the study's own) is in
+    the last column. A figure that is a photograph is left out.
     """
     tables, figures = folder / "tables", folder / "figures"
     for place in (tables, figures):
         place.mkdir(parents=True, exist_ok=True)
     for block in (*page.summary, *(block for section in page.sections for block in section.blocks)):
         if isinstance(block, Table):
-            _write_csv(block, tables / f"{block.name}.csv")
+            with (tables / f"{block.name}.csv").open("w", encoding="utf-8", newline="") as out:
+                writer = csv.writer(out, lineterminator="\n")
+                writer.writerow([*block.head, "marked"])
+                for row in (*block.rows, *block.foot):
+                    writer.writerow([*map(_to_value, row.cells), "yes" if row.marked else "no"])
             content = {
                 "name": block.name,
                 "caption": block.caption,
@@ -72,15 +77,6 @@ def _write_parts(page: Page, folder: Path) -> None:
             (tables / f"{block.name}.json").write_text(text, encoding="utf-8")
         elif isinstance(block, Figure) and block.markup.startswith("<svg") and "<image" not in block.markup:
             (figures / f"{block.name}.svg").write_text(make_standalone(block.markup), encoding="utf-8")
-
-
-def _write_csv(table: Table, file: Path) -> None:
-    """The table with its head; what the page marks (fitted sites, the study's own) in a last column."""
-    with file.open("w", encoding="utf-8", newline="") as out:
-        writer = csv.writer(out, lineterminator="\n")
-        writer.writerow([*table.head, "marked"])
-        for row in (*table.rows, *table.foot):
-            writer.writerow([*map(_to_value, row.cells), "yes" if row.marked else "no"])
 
 
 def _to_json(row: Row) -> dict[str, Any]:

@@ -15,14 +15,13 @@ from ..results.runs import CompareResult, RunResult, SimulateResult, is_current
 from ..results.socket import SocketResult
 from ..results.study_results import MODELS
 from ..results.uncertainty import ModelsResult
-from .formats import format_fixed, format_symbol
+from .formats import format_fixed
 
 Curves = dict[str, Array]
 Json = dict[str, Any]
 
 
 Row = TypeVar("Row", bound=ResultPart)  # of a record, or of a site
-PAPER_TISSUES = {"skin": "Skin–adipose", "muscle": "Muscle"}
 
 
 @dataclass(frozen=True)
@@ -119,19 +118,10 @@ class Results:
         """The stored 95 % interval of a parameter."""
         return self.uncertainty.intervals_95[tissue][name] if self.uncertainty else None
 
-    def describe_parameter(self, name: str) -> str:
-        """A parameter's symbol and what it is."""
-        words = {parameter.key: parameter.words for parameter in self.law.parameters}
-        return ", ".join(part for part in (format_symbol(name), words.get(name, "")) if part)
-
-    def describe_tissue(self, tissue: str) -> str:
-        """A tissue as the head of a row; the two of the paper as the paper names them."""
-        return PAPER_TISSUES[tissue] if self.has_paper_tissues else tissue.replace("_", " ").capitalize()
-
     @property
     def has_paper_tissues(self) -> bool:
         """True for the two tissues of the paper, where fat is no tissue of its own."""
-        return self.tissues == tuple(PAPER_TISSUES)
+        return self.tissues == ("skin", "muscle")
 
     @property
     def surface_files(self) -> dict[str, Path]:

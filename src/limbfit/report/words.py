@@ -9,7 +9,7 @@ from typing import Any
 from jinja2 import Environment, PackageLoader, StrictUndefined, Template, Undefined
 
 from . import formats
-from .page import Block, Cell, Figure, Note, Prose, Row, Section, Table
+from .page import Block, Bullets, Cell, Figure, Note, Prose, Row, Section, Table, make_bullets
 
 TEMPLATES = PackageLoader("limbfit.report", "templates")
 _COLUMN = re.compile(r"\| (.*?) \|([|=])(.*?)(?:\|%(.*))?")
@@ -56,6 +56,12 @@ def make_prose(name: str, **facts: Any) -> Prose | None:
     """The paragraph with this name as a block; None where it has nothing to say."""
     text = write_words(name, **facts)
     return Prose(text) if text else None
+
+
+def make_list(name: str, **facts: Any) -> Bullets | None:
+    """The list with this name, each item of which begins a line with ``- ``; None where there are none."""
+    items = re.split(r"^- ", _read_templates()[name][0].render(facts), flags=re.MULTILINE)[1:]
+    return make_bullets(map(_join_lines, items))
 
 
 def make_picture(name: str, markup: str, *, words: str = "", **facts: Any) -> Figure:

@@ -84,9 +84,8 @@ def mend_times(trace: Trace) -> tuple[Trace, list[TraceWarning]]:
         f"{count} of {n} samples have the time of the sample before; they were spread over {size:.3g} s each"
     )
     numbers = {"doubled_times": float(count), "time_step_s": size}
-    return spread, [
-        TraceWarning("times", what, "times that are rounded in the export", "export more digits", numbers)
-    ]
+    cause = "times that are rounded in the export"
+    return spread, [TraceWarning("times", what, cause, "export more digits", numbers)]
 
 
 def _spread_times(time: Array, same: Mask, size: float) -> Array:
@@ -138,12 +137,9 @@ def find_frozen(trace: Trace, line: BrokenLine, rise_N: float) -> list[slice]:
     noise, size = estimate_noise_level(force), find_resolution(force)
     jump = max(2.5 * size, _JUMP_NOISE * noise, _MIN_MOTION * rise_N)
     in_contact = force > np.percentile(force, 2) + _CONTACT_SHARE * rise_N
-    found = []
-    for start, end in find_runs(np.diff(force) == 0.0):
-        last = end  # of the equal samples start..end
-        if last - start + 1 < _FROZEN_SAMPLES or path[last] - path[start] < _MIN_MOTION * float(
-            np.ptp(line.values)
-        ):
+    found, least_mm = [], _MIN_MOTION * float(np.ptp(line.values))
+    for start, last in find_runs(np.diff(force) == 0.0):  # of the equal samples start..last
+        if last - start + 1 < _FROZEN_SAMPLES or path[last] - path[start] < least_mm:
             continue
         away = last + 1 < len(force) and abs(force[last + 1] - force[last]) > jump
         odd = size < noise and in_contact[start] and force[start] < force.max()
@@ -310,10 +306,8 @@ def find_lag(
     late_mm = delay * abs(met)
     step = float(np.median(np.diff(trace.time_s)))
     unseen = find_resolution(trace.displacement_mm) / float(np.abs(speed).max())  # of when a corner was
-    if (
-        delay < max(_MIN_LAG_SD * sd, _MIN_LAG_STEPS * step, unseen)
-        or late_mm < _MIN_HARM * touch.uncertainty_mm
-    ):
+    least = max(_MIN_LAG_SD * sd, _MIN_LAG_STEPS * step, unseen)
+    if delay < least or late_mm < _MIN_HARM * touch.uncertainty_mm:
         return []
     what = (
         f"the force turns {delay:.2g} +- {sd:.1g} s after the displacement, which no passive tissue does: "

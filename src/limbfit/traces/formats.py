@@ -285,7 +285,11 @@ def _read_excel(file: Path, columns: Names) -> ColumnTable:
     openpyxl = _import("openpyxl", "openpyxl", "excel", file.suffix)
     try:
         book = openpyxl.load_workbook(file, read_only=True, data_only=True)
-        sheets = {sheet.title: _read_sheet_rows(sheet) for sheet in book.worksheets}
+        sheets: dict[str, list[Row]] = {}
+        for sheet in book.worksheets:
+            numbered = enumerate(sheet.iter_rows(values_only=True), 1)
+            rows = [(i, [_format_cell(value) for value in row]) for i, row in numbered]
+            sheets[sheet.title] = [row for row in rows if any(row[1])]
         book.close()
     except Exception as error:  # a broken file can fail anywhere in the parser
         raise TraceError(f"not a readable Excel file ({type(error).__name__})") from None
@@ -298,12 +302,6 @@ def _read_excel(file: Path, columns: Names) -> ColumnTable:
     header = _find_header(rows[:MAX_PREAMBLE], columns)
     below = [row for row in rows if row[0] > header[0]]
     return _build_table(header, below, columns, has_preamble=rows[0] != header)
-
-
-def _read_sheet_rows(sheet: Any) -> list[Row]:
-    numbered = enumerate(sheet.iter_rows(values_only=True), 1)
-    rows = [(i, [_format_cell(value) for value in row]) for i, row in numbered]
-    return [row for row in rows if any(row[1])]
 
 
 def _format_cell(value: Any) -> str:

@@ -20,9 +20,12 @@ from .numerics import average_in_bins, estimate_noise_level
 
 COLUMNS = ("time_s", "displacement_mm", "force_N")
 MIN_SAMPLES = 20
-SPEED_RANGE = (0.05, 50.0)
-TRAVEL_RANGE = (0.2, 60.0)
-PEAK_RANGE = (0.05, 200.0)
+# What is plausible: unit, least and most, and what a value looks like that is so only times a factor.
+_PLAUSIBLE: Mapping[str, tuple[str, float, float, Mapping[float, str]]] = {
+    "travel": ("mm", 0.2, 60.0, {1e3: "metres", 1e-3: "micrometres"}),
+    "speed": ("mm/s", 0.05, 50.0, {1e3: "milliseconds", 1e6: "microseconds", 1 / 60: "minutes"}),
+    "peak force": ("N", 0.05, 200.0, {1e3: "kilonewtons", 1e-3: "millinewtons", 9.81e-3: "grams"}),
+}
 _MAX_BINS = 200  # of samples whose mean force is looked at
 _START_SAMPLES, _REST_SHARE = 5, 0.02  # samples at the least that tell the force at the start; of the travel
 _PRESSED_SHARE = 0.5  # of the rise of force: the indenter is in the limb
@@ -140,15 +143,9 @@ def _check_units(trace: Trace, columns: tuple[str, str, str]) -> None:
     if pressed < start - _REST_SHARE * float(np.ptp(u)):
         remedy = "displacement into the limb must be positive: change the sign"
         raise TraceError("the displacement falls", place=columns[1], remedy=remedy)
-    _check_range(
-        float(u.max()) - start, TRAVEL_RANGE, "travel", "mm", {1e3: "metres", 1e-3: "micrometres"}, columns[1]
-    )
-    speed = _compute_typical_speed(trace.time_s, u)
-    guesses = {1e3: "milliseconds", 1e6: "microseconds", 1 / 60: "minutes"}
-    _check_range(speed, SPEED_RANGE, "speed", "mm/s", guesses, columns[0])
-    peak = float(force.max())
-    guesses = {1e3: "kilonewtons", 1e-3: "millinewtons", 9.81e-3: "grams"}
-    _check_range(peak, PEAK_RANGE, "peak force", "N", guesses, columns[2])
+    _check_plausible(float(u.max()) - start, "travel", columns[1])
+    _check_plausible(_compute_typical_speed(trace.time_s, u), "speed", columns[0])
+    _check_plausible(float(force.max()), "peak force", columns[2])
 
 
 def _compute_typical_speed(time: Array, u: Array) -> float:
@@ -165,15 +162,8 @@ def _compute_typical_speed(time: Array, u: Array) -> float:
     return float((u[top] - u[below[-1]]) / duration)
 
 
-def _check_range(
-    value: float,
-    limits: tuple[float, float],
-    quantity: str,
-    unit: str,
-    guesses: dict[float, str],
-    column: str,
-) -> None:
-    low, high = limits
+def _check_plausible(value: float, quantity: str, column: str) -> None:
+    unit, low, high, guesses = _PLAUSIBLE[quantity]
     if low <= value <= high:
         return
     likely = [name for factor, name in guesses.items() if low <= value * factor <= high]

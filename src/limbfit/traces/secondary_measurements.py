@@ -311,9 +311,8 @@ def _check_sizes(place: Array, moved: Array, given: str) -> None:
         what = f"all points lie within {extent:.3g} mm"
         raise TraceError(what, place=_POSITION_COLUMNS[0], remedy="give millimetres")
     if not MIN_MOTION_MM <= largest <= MAX_MOTION_MM:
-        what = (
-            f"the largest displacement is {largest:.3g} mm, and not {MIN_MOTION_MM:g} to {MAX_MOTION_MM:g} mm"
-        )
+        limits = f"{MIN_MOTION_MM:g} to {MAX_MOTION_MM:g} mm"
+        what = f"the largest displacement is {largest:.3g} mm, and not {limits}"
         raise TraceError(what, place=given, remedy="give millimetres")
 
 

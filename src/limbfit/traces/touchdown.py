@@ -74,15 +74,14 @@ def find_touch_down(trace: Trace, line: BrokenLine | None = None) -> TouchDown:
     rough = find_onset(part, sample_noise)
     sample_noise, part = _estimate_noise_near(rough.place_mm, time, travel, force, moving)
     onset = find_onset(part, sample_noise, rough)
+    is_near = onset.place_mm - travel[0] < max(2 * onset.sd, _MIN_APPROACH_MM)
     return TouchDown(
         time_s=float(np.interp(onset.place_mm, np.maximum.accumulate(travel), time)),
         displacement_mm=onset.place_mm,
         uncertainty_mm=onset.sd,
         exponent=onset.exponent,
         baseline_N=onset.baseline_N,
-        in_contact_at_start=bool(
-            onset.place_mm - travel[0] < max(2 * onset.sd, _MIN_APPROACH_MM) and moving < MIN_SAMPLES
-        ),
+        in_contact_at_start=bool(is_near and moving < MIN_SAMPLES),
     )
 
 
@@ -205,9 +204,8 @@ def find_onset(
     if around is not None:
         reach = _SEARCH_SD * around.sd
         low, high = max(around.place_mm - reach, low), min(around.place_mm + reach, high)
-    return _weigh_onsets(
-        part, whiten, np.linspace(low - before_mm, high, _PLACE_COUNT), zeroed=before_mm == 0.0
-    )
+    places = np.linspace(low - before_mm, high, _PLACE_COUNT)
+    return _weigh_onsets(part, whiten, places, zeroed=before_mm == 0.0)
 
 
 def _weigh_onsets(part: OnsetPart, whiten: Array, places: Array, zeroed: bool) -> Onset:

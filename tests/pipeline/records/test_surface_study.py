@@ -21,7 +21,7 @@ from limbfit.pipeline.identification.calibrate import run_calibrate
 from limbfit.pipeline.identification.predict import run_predict
 from limbfit.pipeline.records.secondary_measurements import MAX_POINTS, ChosenPoints, choose_points
 from limbfit.pipeline.records.traces import run_traces
-from limbfit.report.drawing.figures import draw_skin_figure
+from limbfit.report.drawing.figures import draw_seen_figures
 from limbfit.report.sections.identification import make_observed_table
 from limbfit.report.store import load_store
 from limbfit.study import Study
@@ -105,7 +105,7 @@ def test_what_cameras_see_is_fitted_and_predicted(tmp_path: Path, monkeypatch) -
     assert surface["compared"].startswith("24 points, ")
     assert surface["error_percent"] < 10.0
     results = load_store(context.study.results)
-    figure, shown = draw_skin_figure(results, fitted=True), make_observed_table(results)
+    figure, shown = draw_seen_figures(results, fitted=True)[2], make_observed_table(results)
     assert figure is not None
     assert "a: " in figure.markup
     assert shown is not None

@@ -16,7 +16,7 @@ from limbfit.mesh import find_gauges_along
 from limbfit.phantom.robot import write_ultrasound
 from limbfit.pipeline.identification.calibrate import run_calibrate
 from limbfit.pipeline.identification.predict import run_predict
-from limbfit.report.drawing.figures import draw_layer_figure
+from limbfit.report.drawing.figures import draw_seen_figures
 from limbfit.report.store import load_store
 from limbfit.study import SolverTable, Study
 from limbfit.traces import Layers, compute_thinnings, read_layers
@@ -183,6 +183,6 @@ def test_what_ultrasound_sees_is_fitted_and_predicted(tmp_path: Path, monkeypatc
         {"skin": 3.0, "muscle": 9.0}, abs=0.1
     )
     assert (context.store["predict"] / "a+muscle.csv").is_file()
-    figure = draw_layer_figure(load_store(context.study.results), fitted=True)
+    figure = draw_seen_figures(load_store(context.study.results), fitted=True)[0]
     assert figure is not None
     assert "a, muscle" in figure.markup

@@ -15,7 +15,7 @@ from limbfit.pipeline.identification.calibrate import run_calibrate
 from limbfit.pipeline.identification.predict import run_predict
 from limbfit.pipeline.records.records import build_model
 from limbfit.pipeline.records.traces import run_traces
-from limbfit.report.drawing.figures import draw_wave_figure
+from limbfit.report.drawing.figures import draw_seen_figures
 from limbfit.report.sections.identification import make_observed_table
 from limbfit.report.store import load_store
 from limbfit.study import Study
@@ -81,7 +81,7 @@ def test_speeds_are_fitted_and_predicted(tmp_path: Path, monkeypatch) -> None:
     assert muscle["error_percent"] < 10.0
     assert (context.store["predict"] / "a+muscle-waves.csv").is_file()
     results = load_store(context.study.results)
-    figure, shown = draw_wave_figure(results, fitted=True), make_observed_table(results)
+    figure, shown = draw_seen_figures(results, fitted=True)[1], make_observed_table(results)
     assert figure is not None
     assert "a, skin-waves" in figure.markup
     assert shown is not None

@@ -133,10 +133,7 @@ def _build_candidate_models(
 
 
 def _choose_designs(
-    context: Context,
-    found: Sequence[tuple[Candidate, float]],
-    sites: int,
-    left_out: list[str],
+    context: Context, found: Sequence[tuple[Candidate, float]], sites: int, left_out: list[str]
 ) -> dict[str, Any]:
     """The best choices, the study's own, all sites, and the candidates."""
     study = context.study
@@ -204,10 +201,8 @@ def _describe_verdict(designs: dict[str, Design], names: Sequence[str]) -> str:
     own = designs.get("the study's own")
     if own is not None and len(own.chosen) == len(best.chosen):
         share = compute_efficiency(own, best, "D")
-        told = "the study's own choice is as good as the best" if share > 0.95 else (
-            f"the study's own choice is worth {100 * share:.0f} % of the data of the best"
-        )  # fmt: skip
-        words.append(told)
+        worth = "as good as" if share > 0.95 else f"worth {100 * share:.0f} % of the data of"
+        words.append(f"the study's own choice is {worth} the best")
     wide = [name for name, factor in zip(names, best.factors_95) if factor > 2]
     open_too = [name for name, factor in zip(names, every.factors_95) if factor > 2]
     if wide:

@@ -57,6 +57,7 @@ SEEN = {
     "surface_sd_mm": "surface",  # of a component of a move of the skin
     "shear_waves_sd_m_s": "waves",  # of a speed, of which there is one in `READING_S`
 }
+_STATED = ("site", "indenter", "depth_mm", "speed_mm_s", "hold_s")  # of a record, as stored
 DESIGNED, PLAIN, UNSEEN = "designed", "one ramp at each site", "by force alone"
 
 
@@ -167,8 +168,17 @@ def run_protocol(
         compute_prior_information(known, space), rows, "A" if criterion == "A" else "D", stiffness
     )
     off_mm = estimate_surface_error_mm(study, context.store)
-    options, blind = ([one.to_option(rest_s, off_mm, which) for one in found] for which in (0, 1))
-    plans = _build_plans([one.planned for one in found], options, budget, wanted)
+    recorded, information, peaks_N = zip(*found)
+    seconds = [one.seconds + rest_s for one in recorded]
+    shares = [compute_expected_share(one.model, off_mm) for one in recorded]
+    options, blind = (
+        [
+            RecordOption((one.site, one.indenter), *rest)
+            for one, *rest in zip(recorded, seconds, which, shares)
+        ]
+        for which in zip(*information)
+    )
+    plans = _build_plans(recorded, options, budget, wanted)
     options_of: dict[str, Sequence[RecordOption]] = dict.fromkeys(plans, options)
     if noises.has_secondary:
         plans[UNSEEN] = plan_records(blind, budget, wanted)
@@ -177,8 +187,11 @@ def run_protocol(
         _judge_plan(name, chosen, options_of[name], budget, wanted, names, determine, pressures)
         for name, chosen in plans.items()
     ]
-    candidates = [one.to_row(rest_s) for one in found]
-    chosen = (found[i].planned.model for i in plans[DESIGNED])
+    candidates = [
+        ProtocolRecord(**{key: getattr(one, key) for key in _STATED}, seconds=of, peak_force_N=peak)
+        for one, of, peak in zip(recorded, seconds, peaks_N)
+    ]
+    chosen = (recorded[i].model for i in plans[DESIGNED])
     histories = [LoadHistory.from_knots(model.knots_s, model.knots_mm) for model in chosen]
     left_out += describe_untested_times(histories, socket_times)
     content = ProtocolResult(
@@ -263,37 +276,14 @@ def _add_gauges(model: SiteModel, noises: RecordNoise) -> SiteModel:
     return model
 
 
-@dataclass(frozen=True, eq=False)
-class SimulatedRecord:
-    """A planned record at every draw of the tissues.
-
-    ``information`` (2, d, p, p) is what it tells, with what is seen beside its force and without: zero where
-    its simulation does not come to its end. ``peak_N`` is its largest force at the first draw.
-    """
-
-    planned: PlannedRecord
-    information: Array
-    peak_N: float
-
-    def to_option(self, rest_s: float, surface_mm: float, which: int) -> RecordOption:
-        """What may be chosen; its site's surfaces are off by so much."""
-        planned, share = self.planned, compute_expected_share(self.planned.model, surface_mm)
-        place = planned.site, planned.indenter
-        return RecordOption(place, planned.seconds + rest_s, self.information[which], share)
-
-    def to_row(self, rest_s: float) -> ProtocolRecord:
-        """What is stored of it; it takes so long a rest as well."""
-        keys = ("site", "indenter", "depth_mm", "speed_mm_s", "hold_s")
-        stated = {key: getattr(self.planned, key) for key in keys}
-        return ProtocolRecord(**stated, seconds=self.planned.seconds + rest_s, peak_force_N=self.peak_N)
-
-
 def _simulate_planned(
     context: Context, folder: Path, planned: Sequence[PlannedRecord], tissues: Array, noise: RecordNoise
-) -> tuple[list[SimulatedRecord], list[str]]:
+) -> tuple[list[tuple[PlannedRecord, Array, float]], list[str]]:
     """Simulate each record at each draw, with derivatives; and what was left out.
 
-    That is what does not come to its end, or presses harder at the first draw than the device may.
+    That is what does not come to its end, or presses harder at the first draw than the device may. Beside
+    each record is what it tells, (2, d, p, p) with what is seen beside its force and without, zero where its
+    simulation does not come to its end; and its largest force at the first draw.
     """
     cache, (draws, p), found, left_out = open_experiment_cache(context, folder), tissues.shape, [], []
     names, limit = context.study.tissues, context.study.acquire.force_limit_N
@@ -314,7 +304,7 @@ def _simulate_planned(
         elif failed == draws:
             left_out.append(f"{one.words}: not simulated to the end")
         else:
-            found.append(SimulatedRecord(one, information, peak_N))
+            found.append((one, information, peak_N))
             if failed:
                 where = f"at {failed} of {draws} draws"
                 left_out.append(f"{one.words}: not simulated to the end {where}, and is not counted there")

@@ -44,11 +44,6 @@ def estimate_coarse_error(order: float | None, ratio: float) -> float:
     return 1.0 if order is None else min(1.0 / (1.0 - ratio**-order), _MAX_ERROR_FACTOR)
 
 
-def estimate_fine_error(order: float | None, ratio: float) -> float:
-    """The same of the finer of the two."""
-    return 1.0 if order is None else min(1.0 / max(ratio**order - 1.0, 1e-9), _MAX_ERROR_FACTOR)
-
-
 @dataclass(frozen=True)
 class Extrapolation:
     """What a quantity tends to as meshes get finer, and the order at which it does.
@@ -161,10 +156,7 @@ def correct_answer(
 
 
 def _estimate_mesh_errors(
-    simulator: RecordSimulator,
-    parameters: Array,
-    searched: Responses,
-    others: Sequence[SiteRecord | None],
+    simulator: RecordSimulator, parameters: Array, searched: Responses, others: Sequence[SiteRecord | None]
 ) -> tuple[Array, ...]:
     """One standard deviation (n,) N of what the study's meshes lack at every site.
 
@@ -198,7 +190,8 @@ def _estimate_mesh_errors(
 def estimate_own_mesh_error(table: MeshTable) -> float:
     """One standard deviation of what the study's own mesh lacks, over its difference from the coarser one."""
     ratio = COARSENING_FACTOR if table.coarse is None else table.coarse.edge_near_mm / table.edge_near_mm
-    return estimate_fine_error(MESH_ORDERS[table.element], ratio)
+    order = MESH_ORDERS[table.element]
+    return 1.0 if order is None else min(1.0 / max(ratio**order - 1.0, 1e-9), _MAX_ERROR_FACTOR)
 
 
 def estimate_linearised(
@@ -223,10 +216,7 @@ def estimate_linearised(
 
 
 def sample_intervals(
-    simulator: RecordSimulator,
-    found: Calibration,
-    correction: FineMeshCorrection,
-    moves: bool = True,
+    simulator: RecordSimulator, found: Calibration, correction: FineMeshCorrection, moves: bool = True
 ) -> tuple[Calibration, Uncertainty]:
     """The answer, which ``moves`` to what is most probable where that is wanted, and what is known of it.
 

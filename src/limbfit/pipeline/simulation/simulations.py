@@ -25,10 +25,7 @@ class SimulationCache:
     """
 
     def __init__(
-        self,
-        folder: Path,
-        also: Iterable[Path] = (),
-        work: Callable[[SimulationJob], Simulation] = simulate,
+        self, folder: Path, also: Iterable[Path] = (), work: Callable[[SimulationJob], Simulation] = simulate
     ) -> None:
         self.kept, self.work = ResultFiles(folder, also), work
 

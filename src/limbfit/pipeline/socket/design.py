@@ -177,8 +177,7 @@ def _compute_pressed_recipe(unloaded: SocketRun, plain: Recipe, target: Target, 
 
     def make() -> Made:
         result = press_limb(
-            problem,
-            lambda step: tell(step.time / end, f"target pressure: {step.time:.2f} of {end:g} s"),
+            problem, lambda step: tell(step.time / end, f"target pressure: {step.time:.2f} of {end:g} s")
         )
         if not result.completed:
             raise RunError(

@@ -27,10 +27,7 @@ def write_shop_package(folder: Path, limb: SocketLimb, face: Socket, wall: Surfa
     write_surface(shop / "wall.stl", wall)
     trim = face.points[face.brim]
     write_table(shop / "trim-line.csv", ["x_mm", "y_mm", "z_mm"], trim.tolist())
-    files = {
-        "wall.stl": "the wall, as a closed body",
-        "trim-line.csv": "the trim line, a closed curve",
-    }
+    files = {"wall.stl": "the wall, as a closed body", "trim-line.csv": "the trim line, a closed curve"}
     left_out, deviation = list[str](), None
     try:
         write_surface(shop / "wall.3mf", wall)

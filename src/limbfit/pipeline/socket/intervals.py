@@ -49,10 +49,6 @@ class ParameterSpread:
     relaxation: Array | float = 0.0
     fall: Array | float = 0.0
 
-    def relax(self, own_weight: float, shift: Array, relaxation: Array, fall: Array) -> ParameterSpread:
-        """The same when a socket has been worn for long, of what `RelaxationSpread` says."""
-        return ParameterSpread(own_weight * self.covariance, own_weight * self.off, shift, relaxation, fall)
-
     @property
     def is_relaxed(self) -> bool:
         """True if relaxation beyond the records counts."""

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...anatomy.meshing.layers import LayerSpec, build_liner_surface
-from ...anatomy.meshing.meshing import MeshSettings, mesh_limb
+from ...anatomy.meshing.meshing import mesh_limb
 from ...anatomy.surfaces.surfaces import Anatomy, load_anatomy
 from ...arrays import Array
 from ...donning import (
@@ -86,23 +86,20 @@ class SocketLimb:
         if not is_meshed(file):
             report("a mesh of the whole limb")
             fine = BELOW_BRIM_MM - float(self.outer.height(brim.points).max())
-            settings = self._choose_mesh_settings(mesh_edge_mm(self.study, brim))
+            edge_mm, liner_mm = mesh_edge_mm(self.study, brim), self.study.socket.liner.thickness_mm
+            settings, liner = mesh_settings(self.study), (LayerSpec(LINER, liner_mm),) if liner_mm else ()
+            settings = replace(
+                settings,
+                element="tet10",
+                layers=(*liner, *settings.layers),
+                edge_near_mm=edge_mm,
+                edge_far_mm=max(FAR * edge_mm, self.study.mesh.edge_far_mm),  # no pins press there
+                growth=GROWTH,
+                flatness=FLATNESS,
+            )
             mesh, facts = mesh_limb(self.outer, settings, max(fine, 0.0), self.depth)
             keep_mesh(mesh, facts, file)
         return read_vtu(file), read_mesh_facts(file)
-
-    def _choose_mesh_settings(self, edge_mm: float) -> MeshSettings:
-        liner_mm, settings = self.study.socket.liner.thickness_mm, mesh_settings(self.study)
-        liner = (LayerSpec(LINER, liner_mm),) if liner_mm else ()
-        return replace(
-            settings,
-            element="tet10",
-            layers=(*liner, *settings.layers),
-            edge_near_mm=edge_mm,
-            edge_far_mm=max(FAR * edge_mm, self.study.mesh.edge_far_mm),  # no pins press there
-            growth=GROWTH,
-            flatness=FLATNESS,
-        )
 
     @property
     def liner(self) -> LinerFacts:

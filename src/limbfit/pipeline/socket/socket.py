@@ -118,11 +118,11 @@ def _build_spread(
     covariance: Array, off: Array, relaxation: Mapping[str, Any] | None, worn_s: float
 ) -> ParameterSpread:
     """How well parameters are known, as `ParameterSpread` has it, once the socket has been worn so long."""
-    known = ParameterSpread(covariance, off)
     if relaxation is None:
-        return known
+        return ParameterSpread(covariance, off)
     spread = RelaxationSpread.from_stored(RelaxationBeyond.model_validate(relaxation))
-    return known.relax(spread.own_weight, *spread.interpolate(worn_s))
+    own = spread.own_weight
+    return ParameterSpread(own * covariance, own * off, *spread.interpolate(worn_s))
 
 
 def _describe_shape(run: SocketRun) -> SocketShape:

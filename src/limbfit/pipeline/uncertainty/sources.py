@@ -18,7 +18,7 @@ from ...anatomy.sites.sites import compute_indenter_axis
 from ...anatomy.surfaces.surfaces import load_anatomy
 from ...arrays import Array
 from ...fe import ORDER_IN_TIME
-from ...indentation import Simulation, SimulationJob, SiteModel, to_vector3
+from ...indentation import SimulationJob, SiteModel, to_vector3
 from ...shapes import SHAPES
 from ...study import Study
 from ..engine.context import Context
@@ -33,11 +33,12 @@ MORE_STEPS = 2
 
 
 @dataclass(frozen=True)
-class SourceVariant:
-    """A changed model of every fitted site, as ``jobs``.
+class Change:
+    """A changed model of every fitted site, as ``jobs``, and what it does.
 
     ``shared``: the change is the same at all sites, or each site has its own. ``counted``: it is a spread
     that enters the covariance, or an alternative that is only told. ``scale``: of the difference of forces.
+    Once simulated, ``force_N`` are the changes of force (n,) N at the sites, zero at those that ``failed``.
     """
 
     source: str
@@ -46,20 +47,13 @@ class SourceVariant:
     shared: bool
     counted: bool
     scale: float = 1.0
+    force_N: tuple[Array, ...] = ()
+    failed: tuple[str, ...] = ()
 
     @property
     def sites(self) -> tuple[str, ...]:
         """The site of each job: what is a site's own is the same for all its records."""
         return tuple(job.model.site for job in self.jobs)
-
-
-@dataclass(frozen=True)
-class Change:
-    """What a variant does: change of force (n,) N at every fitted site; zero at those that ``failed``."""
-
-    variant: SourceVariant
-    force_N: tuple[Array, ...]
-    failed: tuple[str, ...]
 
 
 def simulate_sources(
@@ -68,7 +62,12 @@ def simulate_sources(
     """Simulate all variants of the study, on the meshes of the search, and the records as they are."""
     plain = [record.job(parameters, sensitivities=False) for record in records.searched]
     answers = list(cache.run(plain, context.executor))
-    models = [_hold_penalty(job.model, answer) for job, answer in zip(plain, answers, strict=True)]
+    # With the contact penalty of its simulation no source is mistaken for another penalty, and none is
+    # searched for each variant by a simulation of its own.
+    models = []
+    for job, done in zip(plain, answers, strict=True):
+        held = job.model.steps.model_copy(update={"penalty_per_mm": done.facts.get("penalty_per_mm")})
+        models.append(replace(job.model, steps=held))
     variants = _build_variants(context, folder, records, plain, models)
     jobs = [job for variant in variants for job in variant.jobs]
     total = len(plain) + len(jobs)
@@ -87,15 +86,8 @@ def simulate_sources(
                 differences.append(np.zeros(len(record.compared)))
             else:
                 differences.append(variant.scale * (new - old))
-        found.append(Change(variant, tuple(differences), tuple(failed)))
+        found.append(replace(variant, force_N=tuple(differences), failed=tuple(failed)))
     return found
-
-
-def _hold_penalty(model: SiteModel, answer: Simulation) -> SiteModel:
-    """The model with the contact penalty of its simulation: no source is mistaken for another penalty, and
-    none is searched for each variant by a simulation of its own."""
-    held = {"penalty_per_mm": answer.facts.get("penalty_per_mm")}
-    return replace(model, steps=model.steps.model_copy(update=held))
 
 
 def _build_variants(
@@ -104,15 +96,15 @@ def _build_variants(
     records: RecordSet,
     plain: Sequence[SimulationJob],
     models: Sequence[SiteModel],
-) -> list[SourceVariant]:
+) -> list[Change]:
     """All variants of the study, of ``models`` that hold their contact penalties; their meshes are made."""
-    study, table, found = context.study, context.study.uncertainty, list[SourceVariant]()
+    study, table, found = context.study, context.study.uncertainty, list[Change]()
 
     def add(
         source: str, change: str, changed: Sequence[SiteModel], shared: bool, counted: bool, scale: float = 1
     ) -> None:
         jobs = tuple(replace(job, model=model) for job, model in zip(plain, changed, strict=True))
-        found.append(SourceVariant(source, change, jobs, shared, counted, scale))
+        found.append(Change(source, change, jobs, shared, counted, scale))
 
     thicker = _thicken_layer(context, folder, models)
     add("layer thickness", f"{table.layer_mm:g} mm thicker", thicker, True, True)
@@ -120,8 +112,13 @@ def _build_variants(
     for number, word in directions:
         moved = [_move_site(context, model, number, table.position_mm) for model in models]
         add("site position", f"{table.position_mm:g} mm {word}", moved, False, True)
+    angle = np.radians(table.axis_degrees)
     for number, word in directions:
-        tilted = [_rotate_axis(model, number, table.axis_degrees) for model in models]
+        tilted = []
+        for model in models:
+            axis = np.array(model.axis)
+            off = np.cos(angle) * axis + np.sin(angle) * _build_tangents(axis)[number]
+            tilted.append(replace(model, axis=to_vector3(off)))
         add("site axis", f"{table.axis_degrees:g} degrees {word}", tilted, False, True)
     radius, doubted = table.edge_radius_mm, [SHAPES[m.indenter.shape].is_edge_doubted for m in models]
     if radius > 0 and any(doubted):
@@ -166,12 +163,6 @@ def _build_tangents(axis: Array) -> tuple[Array, Array]:
     along = up - (up @ axis) * axis
     along /= np.linalg.norm(along)
     return along, np.cross(axis, along)
-
-
-def _rotate_axis(model: SiteModel, number: int, degrees: float) -> SiteModel:
-    axis, angle = np.array(model.axis), np.radians(degrees)
-    tilted = np.cos(angle) * axis + np.sin(angle) * _build_tangents(axis)[number]
-    return replace(model, axis=to_vector3(tilted))
 
 
 def _move_site(context: Context, model: SiteModel, number: int, distance_mm: float) -> SiteModel:

@@ -13,12 +13,7 @@ from ...arrays import Array
 from ...identify.fit.multifidelity import MeshCorrection
 from ...identify.fit.objective import SiteResponse
 from ...identify.fit.parameters import build_space
-from ...identify.fit.prediction import (
-    NORMAL_95,
-    RelaxationSpread,
-    compute_force_range,
-    compute_half_width_95,
-)
+from ...identify.fit.prediction import NORMAL_95, RelaxationSpread, compute_force_range, compute_half_width_95
 from ...identify.uncertainty.likelihood import Likelihood, compare_models, fit_alternative
 from ...identify.uncertainty.posterior import Exploration, ExplorationSettings, explore_posterior
 from ...identify.uncertainty.relaxation import limit_verdicts
@@ -158,13 +153,12 @@ class Findings:
 
     def compute_covariance(self, change: Change) -> Array:
         """Of the logarithms (p, p), by one source."""
-        variant = change.variant
-        return self.gain.compute_covariance(change.force_N, variant.shared, variant.sites)
+        return self.gain.compute_covariance(change.force_N, change.shared, change.sites)
 
     @property
     def source_covariance(self) -> Array:
         """Of the logarithms (p, p), by all counted sources."""
-        parts = [self.compute_covariance(change) for change in self.changes if change.variant.counted]
+        parts = [self.compute_covariance(change) for change in self.changes if change.counted]
         return np.sum([np.zeros_like(self.known.covariance), *parts], axis=0)
 
 
@@ -299,18 +293,18 @@ def _summarise_source(found: Findings, change: Change) -> stored.SourceEffect:
 
     A source of each site's own changes parameters by the root of the sum of squares over sites.
     """
-    variant, model = change.variant, found.known.residual_model
+    model = found.known.residual_model
     names = [noise.name for noise in model.noise]
     forces = [100 * float(np.mean(np.abs(d))) / peak for d, peak in zip(change.force_N, model.peaks_N)]
-    if variant.shared:
+    if change.shared:
         shift = found.gain.compute_shift(change.force_N)
     else:
         shift = np.sqrt(np.diag(found.compute_covariance(change)))
     return stored.SourceEffect(
-        source=variant.source,
-        change=variant.change,
-        shared=variant.shared,
-        counted=variant.counted,
+        source=change.source,
+        change=change.change,
+        shared=change.shared,
+        counted=change.counted,
         failed=change.failed,
         force_percent=dict(zip(names, forces)),
         parameters_percent=dict(zip(found.known.names, (100 * np.expm1(shift)).tolist())),
@@ -370,9 +364,7 @@ def _write_prediction(
     inside = (measured >= low) & (measured <= high)
     facts |= {_SHARES[k]: 100 * float(np.sqrt(v.mean())) / peak for k, v in variances.items()}
     return stored.IntervalParts(
-        **facts,
-        inside_percent=100 * float(inside.mean()),
-        half_width_percent=100 * half_width / peak,
+        **facts, inside_percent=100 * float(inside.mean()), half_width_percent=100 * half_width / peak
     )
 
 
@@ -403,12 +395,11 @@ def _describe_verdict(
         )
     if found.evidence is not None:
         words.append(found.evidence.verdict[0].upper() + found.evidence.verdict[1:] + ".")
-    counted = [change for change in found.changes if change.variant.counted]
+    counted = [change for change in found.changes if change.counted]
     if counted:
         largest = max(counted, key=lambda change: float(np.trace(found.compute_covariance(change))))
         words.append(
-            f"Beyond the records, {largest.variant.source} ({largest.variant.change}) would change the "
-            "parameters most."
+            f"Beyond the records, {largest.source} ({largest.change}) would change the parameters most."
         )
     coverage = predictions.coverage_heldout_percent
     if coverage is not None:
@@ -446,22 +437,17 @@ def _describe_profiles(explored: Exploration) -> list[str]:
 
 
 def _write_flat(file: Path, rows: Sequence[ResultPart]) -> None:
-    """Rows of one kind as CSV, their lists and dictionaries as columns."""
-    flat = [_flatten_row(row) for row in rows]
+    """Rows of one kind as CSV, their lists and dictionaries as columns; what is None has none."""
+    flat = []
+    for row in rows:
+        cells: dict[str, Any] = {}
+        for key, value in row.to_plain().items():
+            if isinstance(value, dict):
+                cells |= {f"{key}.{name}": number for name, number in value.items()}
+            elif isinstance(value, list) and len(value) == 2 and not isinstance(value[0], str):
+                cells |= {f"{key}_low": value[0], f"{key}_high": value[1]}
+            elif value is not None:
+                cells[key] = " ".join(map(str, value)) if isinstance(value, list) else value
+        flat.append(cells)
     fullest: dict[str, Any] = max(flat, key=len, default={})  # a row without an interval lacks its columns
     write_table(file, list(fullest), [[row.get(head) for head in fullest] for row in flat])
-
-
-def _flatten_row(row: ResultPart) -> dict[str, Any]:
-    """Lists and dictionaries of a row as columns; what is None has none."""
-    flat: dict[str, Any] = {}
-    for key, value in row.to_plain().items():
-        if isinstance(value, dict):
-            flat |= {f"{key}.{name}": number for name, number in value.items()}
-        elif isinstance(value, list) and len(value) == 2 and not isinstance(value[0], str):
-            flat |= {f"{key}_low": value[0], f"{key}_high": value[1]}
-        elif isinstance(value, list):
-            flat[key] = " ".join(map(str, value))
-        elif value is not None:
-            flat[key] = value
-    return flat

@@ -167,30 +167,25 @@ def _list_tissues(
 ) -> Iterator[tuple[Material, dict[str, Any]]]:
     """The given tissues and the published ones, and what is said of each."""
     for tissue, values in parameters.items():
-        yield (
-            own[tissue],
-            {
-                "tissue": f"{tissue} (this study)",
-                "kind": "muscle" if tissue == list(parameters)[-1] else "skin",
-                "law": LAWS[law].words,
-                "values": ", ".join(
-                    f"{p.key} = {values[p.key]:.4g} {p.unit}".rstrip() for p in LAWS[law].parameters
-                ),
-                "conversion": "none",
-                "source": "this study",
-            },
-        )
+        stated = (f"{p.key} = {values[p.key]:.4g} {p.unit}".rstrip() for p in LAWS[law].parameters)
+        facts = {
+            "tissue": f"{tissue} (this study)",
+            "kind": "muscle" if tissue == list(parameters)[-1] else "skin",
+            "law": LAWS[law].words,
+            "values": ", ".join(stated),
+            "conversion": "none",
+            "source": "this study",
+        }
+        yield own[tissue], facts
     # The paper's, where no study gives its own.
     relaxation: dict[str, PronyTerms] = {"skin": ((3.57, 0.32),), "muscle": ((3.47, 0.34),)}
     if parameters:
         first, last = (tuple(map(tuple, list(own.values())[i].table().prony)) for i in (0, -1))
         relaxation = {"skin": first, "muscle": last}
     for known in PUBLISHED:
-        yield (
-            known.material(relaxation[known.kind]),
-            {"tissue": known.name, "law": "sum of Ogden terms"}
-            | {key: getattr(known, key) for key in ("kind", "values", "conversion", "source")},
-        )
+        facts = {key: getattr(known, key) for key in ("kind", "values", "conversion", "source")}
+        facts |= {"tissue": known.name, "law": "sum of Ogden terms"}
+        yield known.material(relaxation[known.kind]), facts
 
 
 def compress(material: Material, times: Array, compression_percent: float) -> tuple[Array, float, float]:

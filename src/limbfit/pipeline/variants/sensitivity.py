@@ -7,6 +7,7 @@ one with the thinnest and the one with the thickest tissue over bone.
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +31,6 @@ from ..records.records import load_records
 from ..simulation.limb_geometry import LimbGeometry
 from ..simulation.simulations import SimulationCache, open_experiment_cache
 from .variants import (
-    ChosenSite,
     Variant,
     VariantRow,
     check_variants,
@@ -78,13 +78,7 @@ def summarise_volumes(J: Array, volumes: Array) -> dict[str, float]:
     share = np.cumsum(volumes[order]) / volumes.sum()
     low, high = np.interp([0.01, 0.99], share, J[order]).tolist()
     beyond = float(volumes[np.abs(J - 1.0) > ALLOWED].sum() / volumes.sum())
-    return {
-        "J_min": float(J.min()),
-        "J_low": low,
-        "J_high": high,
-        "J_max": float(J.max()),
-        "beyond_percent": 100.0 * beyond,
-    }
+    return dict(zip(NO_VOLUME, (float(J.min()), low, high, float(J.max()), 100.0 * beyond), strict=True))
 
 
 FACTORS = (0.5, 2.0)
@@ -101,27 +95,17 @@ def run_stiffness(context: Context, folder: Path, *, sites: Sequence[str] = ()) 
     if "m" in law.keys:
         m = float(np.exp(np.mean([np.log(values["m"]) for values in identified.values()])))
         equal = {tissue: values | {"m": m} for tissue, values in identified.items()}
-    chosen, cache = choose_sites(context, sites), open_experiment_cache(context, folder)
-    variants = [variant for one in chosen for variant in _build_stiffer(one, equal, law.moduli)]
+    variants, cache = list[Variant](), open_experiment_cache(context, folder)
+    for one in choose_sites(context, sites):
+        base = {"tissue": None, "factor": 1.0}
+        variants.append(Variant(one, one.model, equal, "as identified", base, base=True))
+        for tissue, factor in product(equal, FACTORS):
+            stiffer = equal[tissue] | {key: factor * equal[tissue][key] for key in law.moduli}
+            label, facts = f"{tissue} c x {factor:g}", {"tissue": tissue, "factor": factor}
+            variants.append(Variant(one, one.model, equal | {tissue: stiffer}, label, facts))
     local = _collect_derivatives(context, cache, identified)
     more: dict[str, Any] = {"equal_m": m, "factors": FACTORS, "local": local}
     run_variants(context, folder, stored.StiffnessResult, variants, cache, **more)
-
-
-def _build_stiffer(chosen: ChosenSite, equal: Parameters, moduli: Sequence[str]) -> list[Variant]:
-    base = Variant(chosen, chosen.model, equal, "as identified", {"tissue": None, "factor": 1.0}, base=True)
-    changed = [
-        Variant(
-            chosen,
-            chosen.model,
-            equal | {tissue: values | {key: factor * values[key] for key in moduli}},
-            f"{tissue} c x {factor:g}",
-            {"tissue": tissue, "factor": factor},
-        )
-        for tissue, values in equal.items()
-        for factor in FACTORS
-    ]
-    return [base, *changed]
 
 
 def _collect_derivatives(
@@ -253,20 +237,9 @@ def run_refinement(
 ) -> None:
     """Force at sites on meshes whose edges are ``factors`` times the study's, and what it tends to."""
     parameters, chosen = context.results.calibration.parameters, choose_sites(context, sites)
-    variants = _build_variants(context, folder, chosen, _choose_factors(factors), parameters)
-    run_variants(context, folder, stored.RefinementResult, variants, find_more=_find_limit)
-
-
-def _build_variants(
-    context: Context,
-    folder: Path,
-    chosen: Sequence[ChosenSite],
-    factors: Sequence[float],
-    parameters: Parameters,
-) -> list[Variant]:
-    """Each site on each mesh; those that are not there yet are made."""
-    settings, stored = mesh_settings(context.study), context.results.mesh.sites
-    others = [(one.model, factor) for one in chosen for factor in factors if factor != 1.0]
+    settings, meshes = mesh_settings(context.study), context.results.mesh.sites
+    wanted = list(product(chosen, _choose_factors(factors)))
+    others = [(one.model, factor) for one, factor in wanted if factor != 1.0]
     jobs = [
         mesh_job(
             context,
@@ -281,20 +254,18 @@ def _build_variants(
     report = partial(context.tell, "sensitivity-mesh", 0, 0)
     meshed = iter(mesh_models(jobs, [model for model, _ in others], context.executor, report))
     variants = []
-    for one in chosen:
-        for factor in factors:
-            model = one.model if factor == 1.0 else next(meshed)
-            known = stored[model.site] if factor == 1.0 else read_mesh_facts(model.mesh)
-            facts = {
-                "factor": factor,
-                "edge_near_mm": factor * settings.edge_near_mm,
-                "element": settings.element,
-                "nodes": known.nodes,
-                "cells": known.cells,
-            }
-            label = f"edge x {factor:g}"
-            variants.append(Variant(one, model, parameters, label, facts, base=factor == 1.0))
-    return variants
+    for one, factor in wanted:
+        model = one.model if factor == 1.0 else next(meshed)
+        known = meshes[model.site] if factor == 1.0 else read_mesh_facts(model.mesh)
+        facts = {
+            "factor": factor,
+            "edge_near_mm": factor * settings.edge_near_mm,
+            "element": settings.element,
+            "nodes": known.nodes,
+            "cells": known.cells,
+        }
+        variants.append(Variant(one, model, parameters, f"edge x {factor:g}", facts, base=factor == 1.0))
+    run_variants(context, folder, stored.RefinementResult, variants, find_more=_find_limit)
 
 
 def _find_limit(runs: Sequence[VariantRow]) -> dict[str, Any]:
@@ -303,16 +274,13 @@ def _find_limit(runs: Sequence[VariantRow]) -> dict[str, Any]:
     Nothing where they do not tend to anything yet. With an element whose forces do not change in one
     direction, the limit is the finest mesh's force, at no order.
     """
+    keys = ("limit_N", "order", "order_measured", "error_percent")
     own = next(run for run in runs if run["base"])
     done = {run["edge_near_mm"]: run["peak_force_N"] for run in runs if run["peak_force_N"] is not None}
     if len(done) >= 2 and own["edge_near_mm"] in done:
         found = extrapolate_richardson(list(done), list(done.values()), MESH_ORDERS[own["element"]])
         finest = done[min(done)]
         if abs(found.limit - finest) <= FARTHEST * finest:
-            return {
-                "limit_N": found.limit,
-                "order": found.order,
-                "order_measured": found.measured,
-                "error_percent": found.error_percent(done[own["edge_near_mm"]]),
-            }
-    return dict.fromkeys(("limit_N", "order", "order_measured", "error_percent"))
+            off = found.error_percent(done[own["edge_near_mm"]])
+            return dict(zip(keys, (found.limit, found.order, found.measured, off), strict=True))
+    return dict.fromkeys(keys)

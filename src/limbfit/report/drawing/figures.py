@@ -223,14 +223,11 @@ def _draw_ratios(ax: Axes, store: Results, at: int, tissue: str, name: str) -> N
             ax.plot(mark / value, at, marker, color=color, ms=7, mew=1.8, mfc=face, label=label)
 
 
-def draw_layer_figure(store: Results, fitted: bool) -> Figure | None:
-    """Compression of each layer against time at the fitted or held-out sites; None where none was seen."""
-    return _draw_times(store, fitted, "ultrasound", "layers", "compression", "mm")
-
-
-def draw_wave_figure(store: Results, fitted: bool) -> Figure | None:
-    """Speed of shear waves against time at the fitted or held-out sites; None where none was read."""
-    return _draw_times(store, fitted, "shear waves", "waves", "speed", "m_s")
+def draw_seen_figures(store: Results, fitted: bool) -> tuple[Figure | None, ...]:
+    """What was seen beside the force at the fitted or held-out sites, where it was: layers, waves, skin."""
+    layers = _draw_times(store, fitted, "ultrasound", "layers", "compression", "mm")
+    waves = _draw_times(store, fitted, "shear waves", "waves", "speed", "m_s")
+    return layers, waves, _draw_skin(store, fitted)
 
 
 @plots.styled
@@ -257,8 +254,8 @@ def _draw_times(store: Results, fitted: bool, kind: str, stem: str, what: str, u
 
 
 @plots.styled
-def draw_skin_figure(store: Results, fitted: bool) -> Figure | None:
-    """Predicted against measured displacement of the skin at fitted or held-out sites; None: not seen."""
+def _draw_skin(store: Results, fitted: bool) -> Figure | None:
+    """Predicted against measured displacement of the skin."""
     rows = [one for one in _read_curves(store, fitted, "surface") if "displacement_simulated_mm" in one[2]]
     if not rows:
         return None

@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...arrays import Array
 from ...mesh import read_vtu
 from ...results.limb import PlacedSite
 from ...web import extract_interface, pack, read_shell, to_shell, to_volume_shape
@@ -133,15 +132,12 @@ def _cut_field(store: Results, row: PlacedSite, file: Path) -> dict[str, NDArray
     }
 
 
-def _thin_values(values: Array, stride: int) -> list[float | None]:
-    """Every so many values with five digits, and the last one."""
-    chosen = np.unique(np.r_[np.arange(0, len(values), stride), len(values) - 1])
-    return [float(f"{value:.5g}") if math.isfinite(value) else None for value in values[chosen]]
-
-
 def _to_lists(curves: Curves) -> dict[str, list[float | None]]:
-    stride = max(1, math.ceil(len(next(iter(curves.values()))) / MAX_SAMPLES))
-    return {name: _thin_values(curves[name], stride) for name in _COLUMNS if name in curves}
+    """Every so many values of each curve with five digits, and the last one."""
+    count = len(next(iter(curves.values())))
+    chosen = np.unique(np.r_[0 : count : max(1, math.ceil(count / MAX_SAMPLES)), count - 1])
+    columns = {name: curves[name][chosen] for name in _COLUMNS if name in curves}
+    return {name: [float(f"{v:.5g}") if math.isfinite(v) else None for v in x] for name, x in columns.items()}
 
 
 _KINDS = ("measured", "simulated", "one_material", "low", "high")

@@ -147,13 +147,6 @@ def make_picture_figure(
     return make_figure(drawing, name, words=words, **facts)
 
 
-def write_png(drawing: Drawing, file: Path) -> None:
-    """Store a drawing; the file appears when it is whole."""
-    draft = file.with_suffix(".part")
-    drawing.savefig(draft, format="png", dpi=_DPI)
-    draft.replace(file)
-
-
 def _draw_panel(ax: Axes, pixels: Array, view: View, marks: list[Mark], title: str) -> None:
     w, h = view.size
     ax.imshow(pixels, extent=(0, w, h, 0), interpolation="antialiased")

@@ -28,7 +28,9 @@ def draw_stage(results: Path, stage: str, file: Path) -> Path:
     if "skin" not in store.surface_files:
         raise InputError("no surfaces are stored", file=results, remedy="run the stage surfaces first")
     with pictures.silence_display_warning():
-        pictures.write_png(_SHEETS[stage](store), file)
+        draft = file.with_suffix(".part")  # the file appears when it is whole
+        _SHEETS[stage](store).savefig(draft, format="png")
+    draft.replace(file)
     return file
 
 

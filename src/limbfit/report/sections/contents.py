@@ -5,10 +5,10 @@ from statistics import fmean
 from typing import Any
 
 from ...extensions import Registry
-from ..formats import format_number, format_parameter
-from ..page import Block, KeyNumber, Note, Page, Section, make_bullets
+from ..formats import format_number
+from ..page import Block, KeyNumber, Note, Page, Section
 from ..store import Results
-from ..words import make_prose, make_section, write_words
+from ..words import make_list, make_prose, make_section, write_words
 from . import design, identification, inputs, methods, simulations, socket, uncertainty, variants
 
 Maker = Callable[[Results, Any], Section]
@@ -26,8 +26,6 @@ _OWN: dict[str, Maker] = {
     "socket_design": socket.make_socket_design_section,
 }
 SECTIONS = Registry("report section", _OWN)
-
-_RANKS = {"determined": 0, "weakly": 1, "not": 2}
 
 
 def make_page(store: Results) -> Page:
@@ -106,20 +104,4 @@ def build_summary(store: Results) -> tuple[Block, ...]:
         errors=[row.error_percent for row in heldout if row.error_percent is not None],
         means=[fmean(one) for one in store.predict.compare_held_out() if one] if store.predict else [],
     )
-    return make_section("summary", prose, make_bullets(_list_verdicts(store))).blocks
-
-
-def _list_verdicts(store: Results) -> tuple[str, ...]:
-    """Which parameters the data determine, best first, and how many combinations of them."""
-    if store.uncertainty is None:
-        return ()
-    groups: dict[str, list[str]] = {}
-    for name, word in store.uncertainty.verdict.items():
-        groups.setdefault(word, []).append(format_parameter(name))
-    best_first = sorted(groups, key=lambda word: _RANKS.get(word.split()[0], 1))
-    words = [f"{word.capitalize()}: {', '.join(groups[word])}." for word in best_first]
-    combinations = store.uncertainty.combinations
-    known = sum(sentence.endswith(": determined") for sentence in combinations)
-    if not known:
-        return tuple(words)
-    return (*words, f"Determined together: {known} of {len(combinations)} products of them (see Parameters).")
+    return make_section("summary", prose, make_list("verdicts", found=store.uncertainty)).blocks

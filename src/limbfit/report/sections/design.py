@@ -35,11 +35,10 @@ def draw_expected_figure(name: str, designs: Designs, work: str) -> Figure:
     """Expected factors of the intervals by parameter; ``work``: what was done, in words."""
     names = list(designs[0].factor_95)
     drawing, (ax,) = make_panels(1, 1, 0.8 + 0.3 * len(names))
-    count = len(designs)
     for k, row in enumerate(designs):
         color, marker = _STYLES[k % len(_STYLES)]
         factors = np.minimum([row.factor_95[name] for name in names], MAX_FACTOR)
-        at = np.arange(len(names)) + 0.16 * (k - (count - 1) / 2)
+        at = np.arange(len(names)) + 0.16 * (k - (len(designs) - 1) / 2)
         ax.plot(factors, at, marker, color=color, ms=5, label=row.design)
     set_rows(ax, [format_parameter(name) for name in names])
     set_log_scale(ax, minor=True)

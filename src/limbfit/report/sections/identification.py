@@ -1,17 +1,15 @@
 """Parameters (table 1 of the paper), what determines them, how they were found; all sites (table 2)."""
 
-from collections import Counter
-from collections.abc import Iterable, Sequence
 from typing import Any
 
-from ...results.identification import CorrelationMatrix, RecordPrediction, SearchStage, average_records
+from ...results.identification import CorrelationMatrix, SearchStage, average_records
 from ..drawing import figures
 from ..drawing.interactive import draw_convergence_curves
 from ..drawing.pictures import draw_field_figure
-from ..formats import NOTHING, format_fixed, format_parameter
-from ..page import Block, Bullets, Cell, Note, Row, Section, Table, make_bullets
+from ..formats import format_fixed, format_parameter
+from ..page import Cell, Note, Section, Table, make_bullets
 from ..store import Results
-from ..words import make_prose, make_row, make_section, make_table, to_numeric, write_words
+from ..words import make_list, make_prose, make_row, make_section, make_table, write_words
 
 EQUAL_PERCENT = 0.01  # of the largest force: what the tolerance of an equilibrium leaves
 
@@ -21,15 +19,18 @@ def make_parameter_section(store: Results) -> Section:
     known = store.uncertainty
     if known is None:
         return make_section("parameters")
-    truth = store.truth.get("parameters", {})
+    truth, relaxation, priors = store.truth.get("parameters", {}), known.relaxation, known.priors
     return make_section(
         "parameters",
         make_table("parameters", store.parameters, store=store, known=known, truth=truth),
         figures.draw_interval_figure(store),
         make_correlation_table(known.correlation),
-        describe_relaxation(store),
-        describe_priors(store),
-        _describe_combinations(store),
+        make_prose("relaxation", found=relaxation) if relaxation else None,
+        make_table("moduli", relaxation.moduli, store=store) if relaxation else None,
+        make_prose("priors", found=priors) if priors else None,
+        make_table("priors", store.parameters, store=store, found=priors) if priors else None,
+        make_prose("combinations", found=known),
+        make_list("list of combinations", found=known, store=store),
         make_prose("residuals", found=known.residuals),
     )
 
@@ -45,40 +46,16 @@ def make_correlation_table(correlation: CorrelationMatrix) -> Table:
     return Table("correlation", write_words("table correlation"), ("", *heads), tuple(rows))
 
 
-def describe_relaxation(store: Results) -> tuple[Block | None, ...]:
-    """What the records tell of relaxation, and the modulus of each tissue at several times after a step."""
-    found = store.uncertainty.relaxation if store.uncertainty else None
-    if found is None:
-        return ()
-    return make_prose("relaxation", found=found), make_table("moduli", found.moduli, store=store)
-
-
-def describe_priors(store: Results) -> tuple[Block | None, ...]:
-    """Each parameter's prior, how much of its variance priors cause, and its interval without them."""
-    found = store.uncertainty.priors if store.uncertainty else None
-    if found is None:
-        return ()
-    return make_prose("priors", found=found), make_table("priors", store.parameters, store=store, found=found)
-
-
-def _describe_combinations(store: Results) -> tuple[Block | None, ...]:
-    """What the data determine of several parameters together, best determined first."""
-    sentences = list(store.uncertainty.combinations) if store.uncertainty else []
-    if not sentences:
-        return ()
-    for name in map(".".join, store.parameters):
-        sentences = [sentence.replace(name, format_parameter(name)) for sentence in sentences]
-    return make_prose("combinations"), Bullets(tuple(sentences))
-
-
 def make_convergence_section(store: Results) -> Section:
     """How the identification went."""
+    found = store.calibration
     return make_section(
         "convergence",
         make_bullets(write_words("end of a stage", stage=stage) for stage in store.stages),
         figures.draw_convergence_figure(store),
         draw_convergence_curves(store),
-        describe_search(store),
+        make_list("doubts", calibration=found, equal_percent=EQUAL_PERCENT) if found else None,
+        make_table("doubtful-simulations", found.doubts.search, folded=True) if found else None,
         (make_iteration_table(store, stage) for stage in store.stages if stage.iterations),
     )
 
@@ -93,33 +70,13 @@ def make_iteration_table(store: Results, stage: SearchStage) -> Table | None:
     return make_table(name, stage.iterations, folded=True, words="iterations", **facts)
 
 
-def describe_search(store: Results) -> tuple[Bullets | None, Table | None]:
-    """What the record of the identification says of its doubtful simulations; nothing where none is."""
-    if store.calibration is None:
-        return None, None
-    found = store.calibration.doubts
-    rows, texts = found.search, []
-    if rows:
-        kinds = Counter(row.kind for row in rows)
-        used = sum(row.iterate is not None for row in rows)
-        texts.append(write_words("doubts of the search", found=found, kinds=kinds, used=used))
-    for site, doubts in found.answer.items():
-        texts += [f"At the answer, site {site}: {doubt.text}." for doubt in doubts]
-    for site, one in store.calibration.contact.items():
-        if (off := one.from_rest_percent or 0.0) > EQUAL_PERCENT:
-            texts.append(write_words("doubt of the answer", site=site, off=off))
-    return make_bullets(texts), make_table("doubtful-simulations", rows, folded=True)
-
-
 def make_fit_section(store: Results) -> Section:
     """Force against time at the fitted sites."""
     rows = [row for row in store.predicted if row.fitted]
     return make_section(
         "fit",
         figures.draw_force_figure(store, rows, "time_s", "forces-fitted", 2),
-        figures.draw_layer_figure(store, fitted=True),
-        figures.draw_wave_figure(store, fitted=True),
-        figures.draw_skin_figure(store, fitted=True),
+        figures.draw_seen_figures(store, fitted=True),
         draw_field_figure(store, store.fitted[:4], "predict", "field"),
     )
 
@@ -136,9 +93,7 @@ def make_prediction_section(store: Results) -> Section:
         figures.draw_error_figure(store),
         figures.draw_force_figure(store, rows, "time_s", "forces-held-out", 3),
         figures.draw_force_figure(store, rows, "displacement_mm", "loops-held-out", 3),
-        figures.draw_layer_figure(store, fitted=False),
-        figures.draw_wave_figure(store, fitted=False),
-        figures.draw_skin_figure(store, fitted=False),
+        figures.draw_seen_figures(store, fitted=False),
         make_observed_table(store),
         Note(write_words("unseen")) if store.predicted and not rows else None,
     )
@@ -166,25 +121,14 @@ def make_domain_section(store: Results) -> Section:
 def make_site_table(store: Results) -> Table | None:
     """Table 2: largest force and errors of each site, fitted sites marked."""
     several = len({row.site for row in store.predicted}) < len(store.predicted)
-    foot = _make_mean_rows(store)
+    means = []
+    for use, fitted in (("fitted", True), ("held out", False)):
+        if chosen := [row for row in store.predicted if row.fitted == fitted]:
+            one = average_records((row.site, row.error_one_material_percent) for row in chosen)
+            means.append((use, chosen, one, average_records((row.site, row.error_percent) for row in chosen)))
+    last = make_table("site-means", means, store=store)
+    foot = last.rows if last else ()
     return make_table("sites", store.predicted, marked="fitted", foot=foot, several=several, store=store)
-
-
-def _make_mean_rows(store: Results) -> Iterable[Row]:
-    for fitted, use, key in ((True, "fitted", "fitted"), (False, "held out", "heldout")):
-        chosen = [row for row in store.predicted if row.fitted == fitted]
-        one = average_records((row.site, row.error_one_material_percent) for row in chosen)
-        if chosen:
-            mean = to_numeric(format_fixed(sum(one) / len(one)) if one else NOTHING)
-            cells = (_count_sites(chosen), use, to_numeric(""), to_numeric(""), mean)
-            yield make_row(f"Mean, {use}", *cells, to_numeric(store.mean_error(key)))
-
-
-def _count_sites(rows: Sequence[RecordPrediction]) -> str:
-    """How many sites, and how many of them the mean lacks."""
-    sites = len({row.site for row in rows})
-    lacking = sites - len(average_records((row.site, row.error_percent) for row in rows))
-    return f"{sites} site{'s' if sites > 1 else ''}" + (f", without {lacking}" if lacking else "")
 
 
 def make_observed_table(store: Results) -> Table | None:

@@ -12,8 +12,8 @@ from ..drawing.figures import thin_curves
 from ..drawing.interactive import draw_record_curves, make_explorer
 from ..drawing.plots import add_legend, make_figure, make_panels, styled
 from ..page import Figure, Note, Prose, Section, Table, make_bullets
-from ..store import Curves, Results
-from ..words import make_prose, make_section, make_table
+from ..store import Results
+from ..words import make_prose, make_section, make_table, write_words
 
 MAX_NAMED_PHASES = 6  # whose names have room in a panel
 
@@ -76,22 +76,19 @@ def draw_record_figure(store: Results, site: str) -> Figure | None:
         return None
     facts = store.traces[site]
     drawing, axes = make_panels(3, 3, 2.5)
-    _draw_record(axes, thin_curves(raw), regular, touch_down)
-    for ax in axes[:2]:
-        _mark_phases(ax, facts.phases)
-    add_legend(drawing, axes[0])
-    return make_figure(drawing, "record", site=site, facts=facts)
-
-
-def _draw_record(axes: Sequence[Axes], raw: Curves, regular: Curves, touch_down: tuple[float, float]) -> None:
     labels = {"time_s": "Time (s)", "displacement_mm": "Displacement (mm)", "force_N": "Force (N)"}
     pairs = (("time_s", "displacement_mm"), ("time_s", "force_N"), ("displacement_mm", "force_N"))
+    thin = thin_curves(raw)
     for ax, (x, y) in zip(axes, pairs, strict=True):
-        ax.plot(raw[x], raw[y], color=MUTED, lw=0.9, label="as recorded")
+        ax.plot(thin[x], thin[y], color=MUTED, lw=0.9, label="as recorded")
         ax.plot(regular[x], regular[y], color=SIMULATED, lw=1.8, label="regularised")
         at = touch_down[x == "displacement_mm"]
         ax.axvline(at, color=INK, lw=0.8, ls="--", label="touch-down")
         ax.set(xlabel=labels[x], ylabel=labels[y])
+    for ax in axes[:2]:
+        _mark_phases(ax, facts.phases)
+    add_legend(drawing, axes[0])
+    return make_figure(drawing, "record", site=site, facts=facts)
 
 
 def _mark_phases(ax: Axes, phases: Sequence[RecordPhase]) -> None:
@@ -110,9 +107,12 @@ def make_record_check_section(store: Results) -> Section:
     """What looks wrong with records, the evidence for it, and each site as predicted from all others."""
     fitted = [name for site in store.fitted for name in (site, *store.records_of(site))]
     flags, left_out = (store.predict.flags, store.predict.left_out) if store.predict else ((), ())
+    failures = write_words(
+        "failures", rows=store.predicted, failed=store.predict.failed if store.predict else ()
+    )
     return make_section(
         "doubts",
-        _list_failures(store),
+        Note(failures) if failures else None,
         make_bullets(f"{flag.text[:1].upper()}{flag.text[1:]}." for flag in flags)
         or make_prose("nothing doubtful", left_out=left_out),
         make_table("flags", flags, format_words=_format_words),
@@ -124,14 +124,6 @@ def make_record_check_section(store: Results) -> Section:
             least=100 * MIN_ERROR_SHARE,
         ),
     )
-
-
-def _list_failures(store: Results) -> Note | None:
-    """A note on the sites that failed and therefore were not compared; None where none did."""
-    sites = [row.record for row in store.predicted if row.not_predicted.keys() - {"one_material"}]
-    failed = [f"Sites not compared with the others: {', '.join(sites)}."] if sites else []
-    failed += [f"Not simulated: {text}." for text in (store.predict.failed if store.predict else ())]
-    return Note(" ".join(failed)) if failed else None
 
 
 def _format_words(name: str) -> str:

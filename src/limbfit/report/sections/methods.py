@@ -10,13 +10,11 @@ from typing import Any
 
 from jinja2 import ChainableUndefined
 
-from ...laws import ACTIVE, OGDEN, split_key
-from ...results.base import Parameters, ResultPart
-from ...results.identification import ParameterBounds
+from ...laws import ACTIVE, OGDEN
 from ...shapes import SHAPES
-from ..formats import NOTHING, format_duration, format_fixed, format_limits, format_symbol, format_with_value
+from ..formats import NOTHING, format_duration
 from ..page import Prose, Section, Table
-from ..store import Json, Results
+from ..store import Results
 from ..words import make_environment, make_prose, make_row, make_section, make_table, to_numeric, write_words
 
 Part = tuple[str, str]  # a heading and its paragraph
@@ -31,93 +29,24 @@ def make_method_section(store: Results) -> Section:
 def write_method_markdown(store: Results) -> str:
     """The same as Markdown, with every setting as a table at its end."""
     name = store.run.study.name if store.run else "Unnamed study"
-    lines = [f"# Methods: {name}", ""]
-    for head, text in write_method_parts(store):
-        lines += [f"## {head}", "", text, ""]
     settings = flatten_settings(store.run.settings if store.run else {})
-    if settings:
-        lines += ["## Every setting", "", "| key | value |", "|---|---|"]
-        cells = ([text.replace("|", "\\|").replace("\n", " ") for text in pair] for pair in settings.items())
-        lines += [f"| {key} | {value} |" for key, value in cells]
-    return "\n".join(lines) + "\n"
+    template = make_environment().get_template("methods.md.j2")
+    return template.render(name=name, parts=write_method_parts(store), settings=settings)
 
 
 def write_method_parts(store: Results) -> tuple[Part, ...]:
     """Heading and paragraph of every part of which something is stored."""
     # Prose, not HTML: the page escapes it.
     environment = make_environment(
-        ChainableUndefined,
-        finalize=lambda value: NOTHING if isinstance(value, ChainableUndefined) else value,
+        ChainableUndefined, finalize=lambda value: NOTHING if isinstance(value, ChainableUndefined) else value
     )
-    records, contact = store.traces, store.calibration.contact.values() if store.calibration else ()
     text = environment.get_template("methods.j2").render(
         store=store,
-        found=store.calibration,
-        settings=store.run.settings if store.run else {},
-        machine=store.run.machine if store.run else {},
-        records=list(records.values()),
-        sites={one.site for one in records.values()},
-        markers=sum(1 for site in store.sites if site.marker),
-        meshes=list(store.mesh.values()),
-        penalties=[one.penalty_per_mm for one in contact if one.penalty_per_mm is not None],
-        depths=[row.penetration_mm for row in store.predicted],
-        heldout={row.site for row in store.predicted if not row.fitted},
-        experiments=_list_experiments(store),
-        seconds=sum(stage.seconds for stage in store.run.stages.values()) if store.run else 0.0,
-        **{"NOTHING": NOTHING, "OGDEN": OGDEN, "ACTIVE": ACTIVE},
-        span=_format_span,
-        pairs=_format_pairs,
         describe_indenter=lambda one: SHAPES[one["shape"]].describe(one),
-        describe_start=_format_start,
-        describe_bounds=_format_bounds,
+        **{"NOTHING": NOTHING, "OGDEN": OGDEN, "ACTIVE": ACTIVE},
     )
     parts = re.findall(r"^## (.*)\n((?:(?!## ).*\n?)*)", text, flags=re.MULTILINE)
     return tuple((head, " ".join(body.split())) for head, body in parts if body.strip())
-
-
-def _format_span(facts: Iterable[ResultPart], key: str, digits: int, factor: int = 1) -> str:
-    """From the least to the largest value of a key, where there is one."""
-    values = [factor * value for fact in facts if (value := getattr(fact, key)) is not None]
-    return " to ".join(format_fixed(end(values), digits) for end in (min, max)) if values else NOTHING
-
-
-def _format_pairs(table: Json) -> str:
-    return ", ".join(f"{key} = {value}" for key, value in table.items() if value not in (None, [], ""))
-
-
-def _format_start(start: Parameters) -> str:
-    texts = {name: map(format_with_value, values, values.values()) for name, values in start.items()}
-    return _join_tissues({name: ", ".join(parts) for name, parts in texts.items()})
-
-
-def _format_bounds(bounds: ParameterBounds) -> str:
-    texts = {}
-    for tissue, values in bounds.lower.items():
-        ends = {key: (low, bounds.upper[tissue][key]) for key, low in values.items()}
-        words = (
-            f"{format_symbol(key)} {format_limits(both)} {split_key(key)[1]}".strip()
-            for key, both in ends.items()
-        )
-        texts[tissue] = ", ".join(words)
-    return _join_tissues(texts)
-
-
-def _join_tissues(texts: dict[str, str]) -> str:
-    """What holds for each tissue; once for all tissues where they are alike."""
-    if len(set(texts.values())) == 1:
-        return next(iter(texts.values()))
-    return "; ".join(f"{tissue} {text}" for tissue, text in texts.items()) or NOTHING
-
-
-def _list_experiments(store: Results) -> list[str]:
-    """Every finished experiment with its options; what is nested stands in its own record."""
-    done = []
-    for name in store.experiments:
-        assert store.run is not None
-        options = store.run.experiments[name].options
-        plain = {key: value for key, value in options.items() if not isinstance(value, dict)}
-        done.append(name + (f" ({_format_pairs(plain)})" if plain else ""))
-    return done
 
 
 def make_timing_section(store: Results) -> Section:

@@ -1,16 +1,13 @@
 """What simulations say about themselves: single ones, those by FEBio too, and those of every site."""
 
-from collections.abc import Sequence
-
-from ...results.identification import RecordPrediction
-from ...results.runs import SimulateResult
 from ..drawing.colours import MEASURED, SIMULATED, TRUTH
 from ..drawing.figures import draw_simulated_figure
 from ..drawing.pictures import draw_field_figure
 from ..drawing.plots import add_legend, make_figure, make_panels, styled
-from ..page import Bullets, Figure, Note, Section, make_bullets
+from ..formats import NOTHING
+from ..page import Figure, Note, Section
 from ..store import Results
-from ..words import make_prose, make_section, make_table, write_words
+from ..words import make_list, make_prose, make_section, make_table, write_columns
 from .methods import make_pair_table
 
 
@@ -19,16 +16,11 @@ def make_simulated_section(store: Results) -> Section:
     sites = [row.site for row in store.simulated]
     return make_section(
         "simulated",
-        _list_warnings(store.simulated),
+        make_list("warnings of sites", rows=store.simulated),
         draw_simulated_figure(store),
         draw_field_figure(store, sites[:4], "simulate", "field-simulated"),
         make_table("simulated", store.simulated),
     )
-
-
-def _list_warnings(rows: Sequence[SimulateResult | RecordPrediction]) -> Bullets | None:
-    """The solver's warnings about the simulations of the sites; None where there are none."""
-    return make_bullets(f"Site {row.site}: {text}" for row in rows for text in row.warnings)
 
 
 def make_comparison_section(store: Results) -> Section:
@@ -61,21 +53,13 @@ def draw_compared_figure(store: Results) -> Figure | None:
 def make_solver_section(store: Results) -> Section:
     """What the simulations say about themselves."""
     found = store.calibration
-    facts = found and {
-        "Objective": found.objective,
-        "Forward simulations of the identification": found.forward_runs,
-        "Of them with derivatives": found.forward_runs_with_sensitivities,
-        "Corrections of the search by the whole meshes": write_words("corrections", rounds=found.corrections),
-        "Starts": found.multistart and found.multistart.summary,
-        "Linear solver": found.linear_solver,
-        "Element": found.element,
-    }
-    known = {key: value for key, value in (facts or {}).items() if value not in (None, "")}
+    columns = write_columns("table solver-facts", found=found) if found else []
+    known = {head: text for head, _, text, _ in columns if text not in ("", NOTHING)}
     failed = ", ".join(row.record for row in store.predicted if not row.completed)
     return make_section(
         "solver",
         Note(f"The simulation did not reach the end of the record at: {failed}.") if failed else None,
-        _list_warnings(store.predicted),
+        make_list("warnings of sites", rows=store.predicted),
         make_table("solver", store.predicted, marked="fitted"),
         make_pair_table("solver-facts", ("Fact", "Value"), known),
     )

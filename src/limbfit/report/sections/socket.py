@@ -39,20 +39,15 @@ def make_socket_section(store: Results, content: stored.SocketResult) -> Section
     folder, states = store.folder / "socket", content.states
     files = {name: folder / f"held-{i}.vtu" for i, name in enumerate(states)}
     name, last = list(states.items())[-1]
-    origin = write_words("origin", of=content.parameters_from)
     return make_section(
         "socket",
         Note(write_words("socket note")),
-        make_prose("socket shape", content=content, origin=origin),
+        make_prose("socket shape", content=content),
         (Note(f"The socket's file: {text}.") for text in content.socket.notes),
         make_prose("socket loads", content=content),
         draw_pressure_figures(store, files, "socket"),
         draw_settling_figure(content),
-        _make_load_table(
-            "socket-regions",
-            {name: state.regions for name, state in states.items()},
-            draws=content.samples.simulated if content.samples else 0,
-        ),
+        _make_load_table(states, "regions", draws=content.samples.simulated if content.samples else 0),
         make_interval_table(last, name),
         make_prose("socket worn", worn_s=content.worn_s),
         make_prose("socket measured", agreement=content.agreement, sensors=content.sensors),
@@ -62,17 +57,17 @@ def make_socket_section(store: Results, content: stored.SocketResult) -> Section
         make_published_table(content.published, last, name),
         make_prose("socket papers") if content.published else None,
         draw_inside_figure(store, name, last.inside, files[name]),
-        _make_load_table("socket-inside", {name: state.inside for name, state in states.items()}),
+        _make_load_table(states, "inside"),
         make_prose("socket balance", content=content),
         map(Note, [*content.warnings, *content.outside_text]),
     )
 
 
-def _make_load_table(name: str, rows: Mapping[str, Sequence[Any]], **facts: Any) -> Table | None:
-    """A table in which the rows of each load stand below a marked row with its name."""
+def _make_load_table(states: Mapping[str, stored.SocketState], part: str, **facts: Any) -> Table | None:
+    """A table in which the rows of each load, a part of its state, stand below a marked row with its name."""
     table, body = None, list[Row]()
-    for load, own in rows.items():
-        table = make_table(name, own, **facts)
+    for load, state in states.items():
+        table = make_table(f"socket-{part}", getattr(state, part), **facts)
         if table is not None:
             body += [make_row(load, *(to_numeric("") for _ in table.head[1:]), marked=True), *table.rows]
     return table and replace(table, rows=tuple(body))
@@ -113,13 +108,12 @@ def make_socket_design_section(store: Results, content: stored.SocketDesignResul
     folder, designs, found = store.folder / "socket_design", content.designs, content.optimisation
     last = len(designs[0].simulation.loads)  # donning is the first
     held = {one.name: folder / f"{one.name}-{last}.vtu" for one in designs}
-    origin = write_words("origin", of=content.parameters_from)
     limits = found.limits_kPa if found else {}
     failed = [(i, trial.reason) for i, trial in enumerate(found.trials if found else ()) if trial.reason]
     return make_section(
         "socket_design",
         Note(write_words("socket design note")),
-        make_prose("socket design", content=content, origin=origin),
+        make_prose("socket design", content=content),
         draw_offset_figure(store, {one.name: folder / f"{one.name}-face.vtp" for one in designs}),
         make_prose("socket design loads", designs=designs),
         draw_pressure_figures(store, held, "socket-design"),

@@ -15,7 +15,7 @@ from ..drawing.figures import draw_forces
 from ..formats import format_fixed, format_parameter, format_with_unit
 from ..page import Bullets, Figure, Note, Prose, Section, Table, make_bullets
 from ..store import Curves, Results, find_compared_quantity
-from ..words import make_prose, make_row, make_section, make_table, to_numeric, write_words
+from ..words import make_prose, make_section, make_table, write_words
 
 TrueValues = dict[str, tuple[float, dict[str, Any]]]  # by name: a true parameter and its line
 MAX_DRAWS, MAX_SITES, MAX_PANELS = 300, 18, 4
@@ -24,7 +24,8 @@ MAX_FACTOR = 1e3  # of an interval over its value, in the figure
 
 def make_uncertainty_section(store: Results, content: stored.UncertaintyResult) -> Section:
     """What the experiment ``uncertainty`` found."""
-    found = content.predictions
+    found, evidence = content.predictions, content.evidence
+    models = (evidence.first, evidence.second) if evidence else ()
     emulator = write_words("emulator", emulator=content.emulator, chain=content.posterior)
     return make_section(
         "uncertainty",
@@ -34,7 +35,9 @@ def make_uncertainty_section(store: Results, content: stored.UncertaintyResult) 
         make_table("uncertainty-combinations", content.combinations, headed=False),
         draw_profile_figure(store, content),
         draw_pairs_figure(store, content),
-        _make_evidence_table(content),
+        make_table(
+            "evidence", models, marked=lambda row: evidence and row.name == evidence.better, found=evidence
+        ),
         make_table("uncertainty-sources", content.sources),
         draw_prediction_figure(store, content),
         make_table("uncertainty-predictions", found.sites, marked="fitted", found=found),
@@ -73,18 +76,6 @@ def _draw_profile(ax: Axes, profile: stored.LikelihoodProfile) -> None:
     ax.plot(values, np.where(beyond, np.nan, rise), color=SIMULATED, marker="o", ms=2.5, label="profile")
     ax.plot(values, dashed, color=SIMULATED, ls="--", lw=1.0, zorder=1.9, label="extrapolated")
     ax.plot(values[beyond], rise[beyond], color=SIMULATED, ls="", marker="o", ms=3.0, mfc="none")
-
-
-def _make_evidence_table(content: stored.UncertaintyResult) -> Table | None:
-    """One material against several."""
-    found = content.evidence
-    if found is None:
-        return None
-    rows = (
-        (found.first, found.heldout.get("first_percent")),
-        (found.second, found.heldout.get("second_percent")),
-    )
-    return make_table("evidence", rows, marked=lambda row: row[0].name == found.better, found=found)
 
 
 def read_true_values(store: Results) -> TrueValues:
@@ -263,13 +254,8 @@ def make_error_table(store: Results, content: stored.RegionsResult) -> Table | N
         return (facts.site if facts else record) in region.fitted_sites
 
     rows = [(region, record) for region in content.regions for record in region.own_error_percent_by_site]
-    foot = []
-    for region in content.regions:
-        errors = region.own_error_percent, region.whole_error_percent
-        means = (to_numeric(format_fixed(error, 2)) for error in errors)
-        number_of_sites = f"{len(region.sites)} site{'s' if len(region.sites) > 1 else ''}"
-        end = "" if region.converged else "not converged"
-        foot.append(make_row(f"Mean, {region.region}", number_of_sites, end, *means))
+    means = make_table("region-means", content.regions)
+    foot = means.rows if means else ()
     return make_table("region-errors", rows, marked=is_fitted, foot=foot, is_fitted=is_fitted)
 
 

@@ -11,9 +11,9 @@ from ...results import variants as stored
 from ..drawing.colours import GRID, INK, MEASURED, MUTED, ONE_MATERIAL, SIMULATED, THIRD, TRUTH
 from ..drawing.plots import add_legend, choose_tissue_style, make_figure, make_panels, make_standalone, styled
 from ..formats import format_fixed
-from ..page import Bullets, Figure, Section, make_bullets
+from ..page import Figure, Section
 from ..store import Results
-from ..words import make_prose, make_section, make_table, write_words
+from ..words import make_list, make_prose, make_section, make_table, write_words
 
 _COLOURS = (SIMULATED, ONE_MATERIAL, TRUTH, THIRD, MUTED, INK)
 _LINES: tuple[Any, ...] = ("-", "--", "-.", (0, (6, 2)), ":", "-")
@@ -21,33 +21,24 @@ _STYLES = tuple(zip(_COLOURS, _LINES, strict=True))
 _RANGE = ("J_min", "J_low", "J_high", "J_max")
 KINDS = {"skin": "Figure 8. Skin, adipose tissue", "muscle": "Figure 9. Muscle, soft tissue below the skin"}
 _OWN = ((SIMULATED, "-"), (THIRD, "-"), (INK, "-"))
-_OTHERS = (
-    (ONE_MATERIAL, "--"),
-    (TRUTH, "-."),
-    (THIRD, (0, (6, 2))),
-    (MUTED, ":"),
-    (MEASURED, (0, (1, 2))),
-)
+_OTHERS = ((ONE_MATERIAL, "--"), (TRUTH, "-."), (THIRD, (0, (6, 2))), (MUTED, ":"), (MEASURED, (0, (1, 2))))
 
 
 def make_sensitivity_section(store: Results, content: stored.VariedResult, name: str) -> Section:
     """Force with one thing changed at a time: in words, in curves, and in a table of the simulations."""
     draw_figure = _FIGURES[name]
     stiffness = content if isinstance(content, stored.StiffnessResult) else None
-    facts = {
-        "element": store.calibration.element if store.calibration else None,
-        "changes": write_words("changes of the force", runs=content.runs),
-    }
+    element = store.calibration.element if store.calibration else None
     title = write_words(f"section {name}")
     words = "compared models" if draw_figure is _draw_site_curves else ""
     return make_section(
         name,
-        make_prose(name, content=content, **facts),
+        make_prose(name, content=content, element=element),
         make_prose("leading tissues", found=_find_leading_tissues(stiffness)) if stiffness else None,
         draw_figure(store, content),
         make_table(name, content.runs, marked="base", words=words, title=title, content=content),
         make_table("sensitivity-c-local", stiffness.local, content=content) if stiffness else None,
-        _list_warnings(content),
+        make_list("warnings of variants", runs=content.runs),
     )
 
 
@@ -153,14 +144,6 @@ def _draw_site_curves(store: Results, content: stored.FrictionResult | stored.In
         ax.set_ylabel("Force (N)")
     add_legend(drawing, axes[0])
     return make_figure(drawing, name, words="compared models", title=write_words(f"section {name}"))
-
-
-def _list_warnings(content: stored.VariedResult) -> Bullets | None:
-    """Simulations that did not reach their end, and what is doubtful about others."""
-    runs = content.runs
-    texts = [(row, f"stopped early: {row.reason}") for row in runs if not row.completed]
-    texts += [(row, text) for row in runs for text in row.warnings]
-    return make_bullets(f"Site {row.site}, {row.label}: {text}" for row, text in texts)
 
 
 _FIGURES: dict[str, Callable[[Results, Any], Figure]] = {  # what draws that of each experiment
