@@ -26,7 +26,7 @@ ACQUIRE = """
 [acquire]
 settle_s = 0.2
 start_gap_mm = 1.0
-pause_s = 0.1
+pause_s = 0.6
 approach_speed_mm_s = 3.0
 ramp_speed_mm_s = 4.0
 search_speed_mm_s = 4.0
