@@ -115,19 +115,18 @@ def test_from_a_folder_of_dicom_to_a_running_calibration(tmp_path, serve, open_p
     page.locator(".view.model[data-state=ready]").wait_for()
     until(lambda: not page.locator("#strip .running").count())
     page.get_by_role("button", name="Take the markers").click()
-    until(lambda: len(load(folder).sites) == 6)
-    truth = json.loads((patient / "truth.json").read_text())["sites"]
+    until(lambda: len(load(folder).sites) == 18)  # the phantom has a marker at each of the paper's sites
+    placed = {site.name: site.near for site in load(folder).sites}
     page.get_by_role("tab", name="Traces").click()
-    for site in load(folder).sites:
-        named = min(
-            truth, key=lambda name: np.linalg.norm(np.subtract(truth[name]["position_mm"], site.position))
-        )
-        assert np.linalg.norm(np.subtract(truth[named]["position_mm"], site.position)) < 1.5
-        page.locator(f"[data-site='{site.name}']").click()
+    for truth in json.loads((patient / "truth.json").read_text())["sites"]:
+        off = {name: np.linalg.norm(np.subtract(near, truth["position_mm"])) for name, near in placed.items()}
+        name = min(off, key=lambda one: off[one])
+        assert off[name] < 1.5
+        page.locator(f"[data-site='{name}']").click()
         page.locator(".view.traces .state.empty input[type=file]").wait_for()
-        drop(page, ".view.traces .record", patient / "traces" / f"site-{named}.csv")
+        drop(page, ".view.traces .record", patient / "traces" / f"site-{truth['name']}.csv")
         page.locator("#trace-facts").wait_for()
-    assert all(site.fitted for site in load_study(folder).sites)
+    assert [site.fitted for site in load_study(folder).sites].count(True) == 6
     assert load_anatomy(folder / "results" / "surfaces").bones
     page.get_by_role("tab", name="Identification").click()
     page.get_by_role("button", name="Run what is missing").click()

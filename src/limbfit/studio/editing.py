@@ -61,13 +61,13 @@ def set_record(file: Path, record: Record, values: Mapping[str, Any]) -> None:
                 _assign(table, values)
 
 
-def add_site(file: Path, name: str, position: Sequence[float], values: Mapping[str, Any]) -> None:
-    """Append a site at a place (LPS, mm) with more keys: ``depth_mm``, ``region``."""
+def add_site(file: Path, name: str, values: Mapping[str, Any]) -> None:
+    """Append a site with its keys: ``position`` or ``near`` (LPS, mm), ``depth_mm``, ``region``."""
     with edit_study(file) as document:
         sites = document.setdefault("sites", tomlkit.aot())
         if not isinstance(sites, list):
             raise StudyError("the study has no [[sites]] to add to", file=file, place="sites")
-        _append(sites, {"name": name, "position": position, **values})
+        _append(sites, {"name": name, **values})
 
 
 def remove_site(file: Path, name: str) -> None:
@@ -133,7 +133,7 @@ def _assign(table: Any, values: Mapping[str, Any]) -> None:
         if value is None:
             table.pop(key, None)
             continue
-        if key == "position":
+        if key in ("position", "near"):
             table.pop("near", None)
             value = [round(float(x), POSITION_DIGITS) for x in value]
         table[key] = value

@@ -108,7 +108,7 @@ def post_site(folder: Folder, site: NewSite) -> Json:
     """Add a site on the skin; returns the changed scene."""
     position = project_to_skin_of_study(folder, site.position)
     region = {"region": site.region} if site.region else {}
-    add_site(folder.file, site.name, position, {**region, "depth_mm": site.depth_mm})
+    add_site(folder.file, site.name, {"position": position, **region, "depth_mm": site.depth_mm})
     return get_scene(folder)
 
 
@@ -125,7 +125,7 @@ def post_markers(folder: Folder, depth_mm: Annotated[float, Body(embed=True, gt=
     numbers = (name for n in count(1) if (name := f"{n:02d}") not in {site.name for site in study.sites})
     for marker in find_markers(read_surface(marked), anatomy.skin):
         if all(np.linalg.norm(marker.position - place) > MARKER_REACH_MM for place in places if place):
-            add_site(folder.file, next(numbers), marker.position.tolist(), {"depth_mm": depth_mm})
+            add_site(folder.file, next(numbers), {"near": marker.position.tolist(), "depth_mm": depth_mm})
     return get_scene(folder)
 
 

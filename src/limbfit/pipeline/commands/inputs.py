@@ -33,14 +33,14 @@ def list_inputs(folder: str | Path) -> dict[str, list[dict[str, Any]]]:
         ]:
             continue
         files = sorted(path for path in place.iterdir() if path.is_file() and not path.name.startswith("."))
-        for kind, path in _sort_files(files):
+        for kind, path in _classify_files(files):
             found[kind].append({"path": path.relative_to(root).as_posix()})
         if any(is_dicom(path) for path in files[:3]):
             found["images"] += [{"path": below.as_posix(), **series} for series in _describe(place)]
     return found
 
 
-def _sort_files(files: list[Path]) -> Iterator[tuple[str, Path]]:
+def _classify_files(files: list[Path]) -> Iterator[tuple[str, Path]]:
     """Each file with its kind, by its suffix; files of another kind, and label maps, are left out."""
     suffixes = {
         "images": tuple(suffix for form in IMAGE_FORMATS for suffix in form.suffixes),
