@@ -10,8 +10,7 @@ import json
 import math
 import time
 import tomllib
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from hashlib import sha256
 from pathlib import Path
 from typing import Annotated, Any
@@ -171,7 +170,7 @@ class Rig:
         self._sent_um: int | None = None
         self._position_um = self._force_mN = self._number = 0
         self._fence_um = self.identity.stroke_um
-        self._start_s = self._due_s = self._moved_s = self._stopped_s = time.monotonic()
+        self._start_s = self._due_s = self._moved_s = time.monotonic()
 
     def measure_force(self) -> float:
         """The force in N."""
@@ -292,7 +291,7 @@ class Rig:
     def _withdraw(self) -> None:
         """Stop, and go home without asking for a force."""
         if not self._stopped:
-            self._stopped, self._stopped_s, self._moved_s = True, time.monotonic(), time.monotonic()
+            self._stopped, self._moved_s = True, time.monotonic()
             self._command(self.table.stage.stop)
             self._command_move(0, RETRACT_UM_S)
             self._move = wire.Move(1, 0, RETRACT_UM_S)
@@ -301,16 +300,6 @@ class Rig:
         if not self._stopped:
             self._notices.append(wire.LimitTrip(code, 1))
             self._withdraw()
-
-
-@contextmanager
-def open_rig(file: Path, checked: str = "never") -> Iterator[Rig]:
-    """A rig by its file, which is closed at the end."""
-    rig = Rig(read_rig(file), checked)
-    try:
-        yield rig
-    finally:
-        rig.close()
 
 
 def measure_mean_force(rig: Rig, seconds: float = 1.0) -> float:

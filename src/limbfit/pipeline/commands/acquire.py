@@ -1,6 +1,7 @@
 """Indentations recorded into a study, and a virtual device whose limb is the study's own simulations."""
 
 from collections.abc import Callable
+from contextlib import closing
 from dataclasses import asdict
 from datetime import UTC, datetime
 from itertools import product
@@ -13,7 +14,7 @@ from pydantic import ValidationError
 
 from ... import acquire
 from ..._version import __version__
-from ...acquire.rig import Rig, find_check, judge_weight, measure_mean_force, open_rig, read_rig, store_check
+from ...acquire.rig import Rig, find_check, judge_weight, measure_mean_force, read_rig, store_check
 from ...acquire.virtual import Endpoint, Fault, Surrogate, VirtualFitSocket, VirtualLimb, fit_surrogate, serve
 from ...errors import InputError, RunError, TraceError, add_location
 from ...results.base import read_curves
@@ -132,7 +133,7 @@ def check_rig(file: str | Path, weight_kg: float, hang: Callable[[], None]) -> d
     ``hang``: is called when the weight is to be hung on the sensor, and returns when it is.
     """
     path = Path(file)
-    with open_rig(path) as rig:
+    with closing(Rig(read_rig(path))) as rig:
         idle_N = measure_mean_force(rig)
         hang()
         loaded_N = measure_mean_force(rig)
