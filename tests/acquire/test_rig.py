@@ -9,7 +9,6 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,7 @@ import pytest
 from lab_rig import compute_force
 
 from limbfit import InputError, acquire_site, check_rig, judge_recording, load_study
-from limbfit.acquire.rig import LOOKAHEAD_S, find_check, read_rig
+from limbfit.acquire.rig import LOOKAHEAD_S, find_check, read_rig, store_check
 from limbfit.errors import RunError
 from limbfit.traces import find_touch_down, read_trace
 
@@ -134,7 +133,7 @@ def test_each_hazard_ends_the_session_before_the_force_is_over_its_limit(
 ) -> None:
     options, reason = HAZARDS[name]
     file = start(**options)
-    check(file)
+    store_check(file, 1.0)
     found = record(planned, file)
     assert not found["completed"]
     assert re.search(reason, found["reason"]), found["reason"]
@@ -170,12 +169,7 @@ def test_a_wrong_force_is_found_by_a_weight_before_any_session(
 
 def test_a_reversed_sign_is_met_at_the_skin_even_if_nobody_checked(planned: Path, start: Start) -> None:
     file = start(scale=-1.0)
-    content = {
-        "rig": sha256(file.read_bytes()).hexdigest(),
-        "at": time.time(),
-        "ratio": 1.0,
-    }
-    file.with_suffix(".check.json").write_text(json.dumps(content))
+    store_check(file, 1.0)
     found = record(planned, file)
     assert "the sign of its force is reversed" in found["reason"]
     assert read_log(file)[:, 2].max() < 1.0
@@ -184,7 +178,7 @@ def test_a_reversed_sign_is_met_at_the_skin_even_if_nobody_checked(planned: Path
 
 def test_a_check_holds_for_a_day_and_for_the_rig_that_was_checked(start: Start) -> None:
     file = start()
-    check(file)
+    store_check(file, 1.0)
     kept = file.with_suffix(".check.json")
     content = json.loads(kept.read_text())
     assert find_check(file) == time.strftime("%Y-%m-%d", time.gmtime(content["at"]))
@@ -200,7 +194,7 @@ def test_a_check_holds_for_a_day_and_for_the_rig_that_was_checked(start: Start) 
 
 def test_a_host_that_is_killed_leaves_a_stage_that_stops_by_itself(planned: Path, start: Start) -> None:
     file = start()
-    check(file)
+    store_check(file, 1.0)
     words = [
         "acquire",
         str(planned),
@@ -229,15 +223,15 @@ def test_a_host_that_is_killed_leaves_a_stage_that_stops_by_itself(planned: Path
     assert log[:, 2].max() < LIMIT_N
 
 
+@pytest.mark.slow
 def test_a_coarse_sensor_is_not_taken_for_a_dead_one(planned: Path, start: Start) -> None:
     """Steps of 0.05 N repeat themselves for seconds; a touch must then be larger than three of them."""
     file = start(resolution=0.05)
-    check(file)
+    store_check(file, 1.0)
     found = record(planned, file)
     assert found["completed"], found["reason"]
-    hang(file, 0.0)
     coarse = start(resolution=0.1)
-    check(coarse)
+    store_check(coarse, 1.0)
     with pytest.raises(InputError, match=r"too coarse for acquire.touch_N; state touch_N = 0.3"):
         acquire_site(
             load_study(planned, recorded=False), "1", address=f"rig:{coarse}", depth_mm=4, replace_record=True
