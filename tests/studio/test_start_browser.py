@@ -133,5 +133,5 @@ def test_from_a_folder_of_dicom_to_a_running_calibration(tmp_path, serve, open_p
     until(lambda: re.search("evaluation [2-9]", page.locator(".view.identification").inner_text()), 900)
     page.get_by_role("button", name="Stop").click()
     until(lambda: not page.locator("#strip .running").count(), 120)
-    assert StudyResults(folder).mesh.sites.keys() == {site.name for site in load(folder).sites}
+    assert StudyResults(folder / "results").mesh.sites.keys() == {site.name for site in load(folder).sites}
     shutil.rmtree(folder)
