@@ -32,7 +32,7 @@ import numpy as np
 from ..arrays import Indices
 from ..errors import RunError, TraceError, add_location
 from ..traces import RegularisedCurve, Trace, find_touch_down, regularise
-from .line_protocol import PINS, Sample
+from .line_protocol import PINS, RATE_HZ, Sample
 
 FIRST_LINE = "#limbfit-recording 1"
 ROWS_PER_BLOCK = 25  # per block: 50 ms
@@ -63,10 +63,10 @@ class Recorder:
     `sample` or `close`, once the file could not be written (a full disk).
     """
 
-    def __init__(self, file: Path, head: dict[str, Any]) -> None:
+    def __init__(self, file: Path, head: dict[str, Any], pins: int = PINS) -> None:
         self.file = file
         self._lines = [FIRST_LINE, f"#head {json.dumps(head, allow_nan=False)}"]
-        self._lines.append(",".join(list_columns(head["device"]["pins"])))
+        self._lines.append(",".join(list_columns(pins)))
         self._rows = self._index = self._crc = 0
         self._failed = ""
         self._finished_blocks: SimpleQueue[bytes | None] = SimpleQueue()
@@ -430,7 +430,7 @@ def _check_saturation(recording: Recording) -> Check:
 
 
 def _check_losses(recording: Recording) -> Check:
-    steps = np.diff(recording.device_us) * (int(recording.head["device"]["rate_hz"]) / 1e6)
+    steps = np.diff(recording.device_us) * (int(recording.head["device"].get("rate_hz", RATE_HZ)) / 1e6)
     lost = int(np.maximum(np.rint(steps) - 1, 0).sum()) if steps.size else 0
     share = 100 * lost / max(len(recording.device_us) + lost, 1)
     found = f"{lost} of {len(recording.device_us) + lost} samples never came"

@@ -165,7 +165,7 @@ def _begin_record(
             "device": identity,
             "settings": settings.model_dump(),
         }
-        return folder, acquire.Recorder(folder / RECORD, head)
+        return folder, acquire.Recorder(folder / RECORD, head, device.identity.pins)
 
 
 def check_recording(
