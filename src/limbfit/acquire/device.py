@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, Protocol
 
 from ..errors import InputError, RunError
+from ..extensions import import_extra
 from . import line_protocol as wire
 
 DEFAULT_PORT = 7714
@@ -107,11 +108,9 @@ class SerialLink(Link):
     gone = "the serial port is gone"
 
     def __init__(self, port: str, baud: int) -> None:
-        try:
-            import serial
-        except ImportError:
-            remedy = "pip install 'limbfit[serial]'"
-            raise InputError("serial ports need pyserial", place="--device", remedy=remedy) from None
+        remedy = "pip install 'limbfit[serial]'"
+        refusal = InputError("serial ports need pyserial", place="--device", remedy=remedy)
+        serial = import_extra("serial", "serial", refusal)
         try:
             super().__init__(serial.Serial(port, baud, timeout=0, write_timeout=0, exclusive=True))
         except _PORT_ERRORS as error:

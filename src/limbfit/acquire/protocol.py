@@ -87,19 +87,8 @@ class Phase(StrEnum):
 
 FINAL = frozenset({Phase.DONE, Phase.STOPPED, Phase.UNREACHABLE})
 WAITS_FOR_OPERATOR = frozenset({Phase.POSITION, Phase.READY})
-CLAMPED = frozenset(
-    {
-        Phase.APPROACH,
-        Phase.BACK,
-        Phase.READY,
-        Phase.SEARCH,
-        Phase.RETURN,
-        Phase.PAUSE,
-        Phase.LOAD,
-        Phase.DWELL,
-        Phase.UNLOAD,
-    }
-)
+_PHASES = list(Phase)
+CLAMPED = frozenset(_PHASES[_PHASES.index(Phase.APPROACH) : _PHASES.index(Phase.RETRACT)])
 
 _PROTOCOL_STEPS: dict[Phase, tuple[Phase, ...]] = {
     Phase.IDLE: (Phase.POSITION,),
