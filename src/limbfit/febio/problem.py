@@ -42,9 +42,7 @@ def to_problem(model: FebModel, indenter: Indenter | None = None, **settings: An
     Raises `ProblemError` if the input has no deformable part, several element types, or motions that are not
     one history.
 
-    Parameters
-    ----------
-    settings : further fields of `Problem` (``element``, ``contact_rule``, ..).
+    ``settings``: further fields of `Problem` (``element``, ``contact_rule``, ..).
     """
     tissue, driven = build_tissue(model), find_drive(model, shaped=indenter is not None)
     touching, name = group_contacts(model), driven.indenter
@@ -270,9 +268,7 @@ def find_drive(model: FebModel, shaped: bool = False) -> Drive:
     Raises `ProblemError` if nodes, or bodies that carry tissue, move by load curves that are not
     multiples of one another, and for motions that limbfit does not support.
 
-    Parameters
-    ----------
-    shaped : True if a shape is given for the body that goes straight in, whose own faces may then be open.
+    ``shaped``: True if a shape is given for the body that goes straight in, whose own faces may then be open.
     """
     touching, motions = group_contacts(model), _read_body_motions(model)
     bodies = {name: motions[name] for name in touching}

@@ -69,10 +69,8 @@ def run_febio(
 
     Raises `RunError` if the program cannot be started, or the folder cannot be written.
 
-    Parameters
-    ----------
-    end_s : the time that the input asks for, s.
-    table : name of the log-file table that holds the indenter's force.
+    ``end_s``: the time that the input asks for, s; ``table``: name of the log-file table that holds the
+    indenter's force.
     """
     output = folder / OUTPUT
     try:
@@ -221,12 +219,9 @@ def judge_run(
 ) -> RunVerdict:
     """Judge a run by its exit, its messages and its log.
 
-    Parameters
-    ----------
-    messages : what FEBio wrote on standard output (its log file says the same).
-    exit_code : of the process; negative or above 128 for a signal.
-    end_s : time that the input asks for.
-    timed_out, limit_s : whether it was stopped by the time limit, and after how many seconds.
+    ``messages``: what FEBio wrote on standard output (its log file says the same). ``exit_code``: of the
+    process; negative or above 128 for a signal. ``end_s``: time that the input asks for. ``timed_out``,
+    ``limit_s``: whether it was stopped by the time limit, and after how many seconds.
     """
     found = _VERSION.search(messages)
     version = found.group(1) if found else ""

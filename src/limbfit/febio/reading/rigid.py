@@ -68,10 +68,8 @@ def find_carried_nodes(
 
     Raises `ProblemError` for a node that two bodies would carry.
 
-    Parameters
-    ----------
-    soft, bodies : names of the deformable and of the rigid materials.
-    conditions : rigid body and ``<bc type="rigid">`` of every set that is tied.
+    ``soft``, ``bodies``: names of the deformable and of the rigid materials; ``conditions``: rigid body and
+    ``<bc type="rigid">`` of every set that is tied.
     """
     tissue = collect_nodes(geometry.select_parts(soft).values())
     found = {}
