@@ -221,8 +221,7 @@ def register_law(law: TissueLaw) -> None:
             )
         if not 0.0 < p.lower <= p.start <= p.upper or p.lower == p.upper:
             raise InputError(
-                f"parameter {p.name} needs 0 < lower <= start <= upper, lower < upper",
-                place=law.name,
+                f"parameter {p.name} needs 0 < lower <= start <= upper, lower < upper", place=law.name
             )
     LAWS.add(law.name, law)
 

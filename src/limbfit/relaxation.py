@@ -36,10 +36,7 @@ def choose_relaxation_times(first_s: float, last_s: float) -> Array:
 def compute_power_law_terms(gamma: float, slope: float, times_s: Array) -> Array:
     """Return the amplitudes g_i (n,), dimensionless, of relaxation times (n,) in s.
 
-    Parameters
-    ----------
-    gamma : amplitude of a term at 1 s.  It belongs to the spacing of the times: with the same relaxation, it
-        is proportional to the step in ``ln tau``.
-    slope : minus the power of time.
+    ``gamma``: amplitude of a term at 1 s.  It belongs to the spacing of the times: with the same relaxation,
+    it is proportional to the step in ``ln tau``. ``slope``: minus the power of time.
     """
     return np.asarray(gamma * np.asarray(times_s, dtype=float) ** -slope)

@@ -87,10 +87,7 @@ THIGH_PLACES = (
     *_build_places("posterior", 7.0, 14, [(np.pi + aside, below) for aside, below in _COLUMN]),
 )
 FITTED = ("01", "05", "10", "15")
-DETAIL_SITES = {
-    "coarse": (*FITTED, "13", "17"),
-    "paper": tuple(place.name for place in SHANK_PLACES),
-}
+DETAIL_SITES = {"coarse": (*FITTED, "13", "17"), "paper": tuple(place.name for place in SHANK_PLACES)}
 
 
 @dataclass(frozen=True)
@@ -234,11 +231,8 @@ class RobotRecord:
 def record(ramp: Ramp, force: Callable[[Array], Array], random: np.random.Generator) -> RobotRecord:
     """Record an indentation.
 
-    Parameters
-    ----------
-    ramp : depth and speed from touch-down.
-    force : force (n,) in N at times (n,) from touch-down, within ``[0, 2 ramp.peak_s]``.
-    random : source of clearance and noise.
+    ``ramp``: depth and speed from touch-down; ``force``: force (n,) in N at times (n,) from touch-down,
+    within ``[0, 2 ramp.peak_s]``; ``random``: source of clearance and noise.
     """
     clearance = random.uniform(*CLEARANCE_MM)
     sd = random.uniform(*FORCE_NOISE_N)
@@ -280,11 +274,7 @@ def write_ultrasound(
 
 
 def write_surface(
-    path: Path,
-    made: RobotRecord,
-    points: Array,
-    moves: Callable[[Array], Array],
-    random: np.random.Generator,
+    path: Path, made: RobotRecord, points: Array, moves: Callable[[Array], Array], random: np.random.Generator
 ) -> None:
     """Write what cameras saw of the skin around the indenter: positions at rest and displacements, at 5 Hz.
 
@@ -302,10 +292,7 @@ def write_surface(
 
 
 def write_waves(
-    path: Path,
-    made: RobotRecord,
-    speeds: Mapping[str, Callable[[Array], Array]],
-    random: np.random.Generator,
+    path: Path, made: RobotRecord, speeds: Mapping[str, Callable[[Array], Array]], random: np.random.Generator
 ) -> None:
     """Write what elastography through the indenter read of a record: speeds of shear waves, m/s, at 1 Hz.
 

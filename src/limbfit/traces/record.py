@@ -203,11 +203,9 @@ def read_columns(
 
     Raises `TraceError` with the file, the row or column, and the remedy.
 
-    Parameters
-    ----------
-    columns : the name of each column that must be there, by its key; a key ends in its unit, as ``time_s``.
-    select : True for the names of others that are read; these are their own keys.
-    gaps : an empty cell of a table is nan.
+    ``columns``: the name of each column that must be there, by its key; a key ends in its unit, as
+    ``time_s``. ``select``: True for the names of others that are read; these are their own keys. ``gaps``: an
+    empty cell of a table is nan.
     """
     table = read_table(file, columns)
     named = {name: key for key, name in columns.items()}

@@ -72,11 +72,9 @@ class LeaveOutFits:
 
     A record is left out with all others of its site, because these tell the same.
 
-    Parameters
-    ----------
-    simulate : returns all sites of ``measured``, in order; cheap.
-    start : the answer (p,), from which the fits start, and which they keep where the data say nothing.
-    tie : (p, k) as `SearchSpace`, which parameters move, and which of them together; None: each by itself.
+    ``simulate``: returns all sites of ``measured``, in order; cheap. ``start``: the answer (p,), from which
+    the fits start, and which they keep where the data say nothing. ``tie``: (p, k) as `SearchSpace`, which
+    parameters move, and which of them together; None: each by itself.
     """
 
     def __init__(
