@@ -25,10 +25,8 @@ def choose_relaxation_times(first_s: float, last_s: float) -> Array:
     `InputError` if the times do not grow from above zero, or the last is more than 1e7 times the first.
     """
     if not 0.0 < first_s < last_s < math.inf or last_s > MAX_SPAN * first_s:
-        raise InputError(
-            f"relaxation times from {first_s:g} to {last_s:g} s span no range",
-            remedy=f"give two that are positive and grow, the second at most {MAX_SPAN:g} times the first",
-        )
+        remedy = f"give two that are positive and grow, the second at most {MAX_SPAN:g} times the first"
+        raise InputError(f"relaxation times from {first_s:g} to {last_s:g} s span no range", remedy=remedy)
     decades = math.log10(last_s / first_s)
     return np.geomspace(first_s, last_s, MIN_TIMES if decades <= MIN_TIMES - 1 + 1e-9 else MAX_TIMES)
 

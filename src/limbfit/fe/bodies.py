@@ -364,7 +364,6 @@ def _place_start(problem: Problem, stated: RigidBody, surface: ContactSurface) -
     offset = find_touching_offset(surface, stated.shape)
     start = stated.shape.move(offset)
     if abs(surface.gaps_at_rest(start).min()) > 1e-6:
-        raise ProblemError(
-            "the indenter never meets the contact faces", remedy="check its centre, axis and the faces"
-        )
+        what = "the indenter never meets the contact faces"
+        raise ProblemError(what, remedy="check its centre, axis and the faces")
     return start

@@ -334,11 +334,9 @@ def _read_body_motions(model: FebModel) -> dict[str, Motion]:
         place = f"line {body.line}, <material>"
         if name in model.carried_nodes and motion.free.any():
             freedoms = ", ".join(f"R{letter}" for letter, free in zip(FREEDOMS, motion.free) if free)
-            raise ProblemError(
-                f"the rigid body {name!r} is neither fixed nor displaced in {freedoms}",
-                place=place,
-                remedy="limbfit solves only for bodies that carry no tissue: fix it there with rigid_fixed",
-            )
+            what = f"the rigid body {name!r} is neither fixed nor displaced in {freedoms}"
+            remedy = "limbfit solves only for bodies that carry no tissue: fix it there with rigid_fixed"
+            raise ProblemError(what, place=place, remedy=remedy)
         lines = [c.line for c in model.conditions if c.body == name and c.kind != "fixed" and c.curve]
         if name in model.carried_nodes and motion.values[:, 3:].any():
             what = f"the rigid body {name!r} carries tissue, and turns: that is not supported"
@@ -386,9 +384,7 @@ def _find_factor(course: _FollowingCurve, times: Array, history: Array) -> float
     values = course.at(times)
     scale = float(values @ history / (history @ history))
     if np.abs(values - scale * history).max() > 1e-9 * np.abs(values).max():
-        raise ProblemError(
-            f"{course.words} is not a multiple of that of the other motions",
-            place=f"line {course.line}",
-            remedy="limbfit moves nodes, and bodies that carry tissue, by one history",
-        )
+        what = f"{course.words} is not a multiple of that of the other motions"
+        remedy = "limbfit moves nodes, and bodies that carry tissue, by one history"
+        raise ProblemError(what, place=f"line {course.line}", remedy=remedy)
     return scale

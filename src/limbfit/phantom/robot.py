@@ -99,9 +99,8 @@ class Ramp:
 
     def __post_init__(self) -> None:
         if not (self.depth > 0 and self.speed > 0):
-            raise SiteError(
-                f"cannot indent {self.depth:g} mm at {self.speed:g} mm/s", remedy="give positive numbers"
-            )
+            what = f"cannot indent {self.depth:g} mm at {self.speed:g} mm/s"
+            raise SiteError(what, remedy="give positive numbers")
 
     @property
     def peak_s(self) -> float:
@@ -152,9 +151,8 @@ def select_sites(sites: Sequence[TrueSite], names: Sequence[str]) -> tuple[TrueS
     available = {site.name for site in sites}
     unknown = [name for name in names if name not in available]
     if unknown:
-        raise SiteError(
-            f"the phantom has no site {unknown[0]!r}", remedy=f"choose from {', '.join(sorted(available))}"
-        )
+        what = f"the phantom has no site {unknown[0]!r}"
+        raise SiteError(what, remedy=f"choose from {', '.join(sorted(available))}")
     found = [site for site in sites if site.name in set(names)]
     unfitted = not any(site.fitted for site in found)
     return tuple(replace(site, fitted=site.fitted or unfitted) for site in found)

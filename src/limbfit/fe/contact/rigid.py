@@ -235,10 +235,8 @@ def check_open_surface(points: Array, faces: NDArray, name: str) -> tuple[Array,
     check_triangles(points, faces, name)
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     if len(np.unique(edges, axis=0)) < len(edges):
-        raise ProblemError(
-            f"the triangles of {name} do not agree on a side, or more than two meet at an edge",
-            remedy="orient them alike, counter-clockwise seen from the tissue",
-        )
+        what = f"the triangles of {name} do not agree on a side, or more than two meet at an edge"
+        raise ProblemError(what, remedy="orient them alike, counter-clockwise seen from the tissue")
     return points, faces.astype(np.int64)
 
 

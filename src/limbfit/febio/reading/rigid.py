@@ -262,11 +262,9 @@ def build_motion(
         forced = np.concatenate([forced, np.broadcast_to(under, (between, 6))])
     if not has_same_rotation(values, forced):
         lines = [c.line for c in own if c.freedom > 2 and c.kind != "fixed"]
-        raise ProblemError(
-            f"the rigid body {name!r} turns about more than one axis",
-            place=f"line {lines[0]}" if lines else "<Rigid>",
-            remedy="hold two of Ru, Rv, Rw, or leave all three free",
-        )
+        what = f"the rigid body {name!r} turns about more than one axis"
+        place = f"line {lines[0]}" if lines else "<Rigid>"
+        raise ProblemError(what, place=place, remedy="hold two of Ru, Rv, Rw, or leave all three free")
     return Motion(times, values, forced)
 
 
