@@ -101,12 +101,8 @@ def _run(file: Path, name: str) -> None:
 
 
 def import_extra(module: str, extra: str, refusal: InputError | None = None) -> Any:
-    """Import a module of a library that an extra of limbfit installs.
-
-    Raises
-    ------
-    InputError
-        Where it is not installed: ``refusal``, where that says better what needs it.
+    """Import a module of a library that an extra of limbfit installs. Raises `InputError` where it is not
+    installed: ``refusal``, where that says better what needs it.
     """
     try:
         return import_module(module)

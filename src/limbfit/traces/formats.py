@@ -33,12 +33,9 @@ Row = tuple[int, list[str]]  # the number of a line, and its cells
 class ColumnTable:
     """Columns of a file by their position.
 
-    Attributes
-    ----------
-    names, units : of the columns; a unit is "" where the file states none.
-    rows : of a table of text.
-    vectors : of a file that holds numbers, one for each name.
-    notes : what was done to read it, in words.
+    ``names``, ``units``: of the columns; a unit is "" where the file states none. ``rows``: of a table of
+    text. ``vectors``: of a file that holds numbers, one for each name. ``notes``: what was done to read it,
+    in words.
     """
 
     names: Sequence[str]

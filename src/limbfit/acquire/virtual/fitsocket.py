@@ -107,13 +107,9 @@ class FaultClock:
 class VirtualFitSocket:
     """One device with one limb in it.
 
-    Attributes
-    ----------
-    time_us : of the device.
-    stopped : the code of the stop that is latched, empty for none.
-    is_armed : a session runs, samples are sent, the watchdog watches.
-    host_has_left : the host has ended its session.
-    acknowledged_us : device time of the newest sample that limbfit has dealt with.
+    ``time_us``: of the device; ``stopped``: the code of the stop that is latched, empty for none;
+    ``is_armed``: a session runs, samples are sent, the watchdog watches; ``host_has_left``: the host has
+    ended its session; ``acknowledged_us``: device time of the newest sample that limbfit has dealt with.
     """
 
     def __init__(

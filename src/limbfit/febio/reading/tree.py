@@ -88,7 +88,7 @@ class XmlNode(list["XmlNode"]):
         try:
             values = [float(part) for part in self.text.split(",")]
         except ValueError:
-            raise self.error(f"{_shorten(self.text)} is not {count} numbers") from None
+            values = []
         if len(values) != count:
             raise self.error(f"{_shorten(self.text)} is not {count} numbers")
         if not all(map(math.isfinite, values)):

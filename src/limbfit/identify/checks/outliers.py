@@ -354,12 +354,9 @@ def find_outliers(
     at bounds to fit that record. Then the sites are judged from ``neutral``, the answer with one material,
     which cannot follow a wrong record as far.
 
-    Parameters
-    ----------
-    simulate : returns all sites; called at ``start``, and at ``neutral`` if that is needed.
-    histories : times (n,) s and depths (n,) mm of each record.
-    simulate_exchange : simulates two sites with parameters (p,), each with the other's record.
-    tie : as `LeaveOutFits`.
+    ``simulate``: returns all sites; called at ``start``, and at ``neutral`` if that is needed. ``histories``:
+    times (n,) s and depths (n,) mm of each record. ``simulate_exchange``: simulates two sites with parameters
+    (p,), each with the other's record. ``tie``: as `LeaveOutFits`.
     """
     if count_sites(measured) < MIN_SITES:
         return (), ()
