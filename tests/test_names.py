@@ -17,7 +17,7 @@ connect constrain continue convert convolve copy correct count couple create cro
 deform delay demo derive describe design diagnose die dilate divide do draw drop edit embed equilibrate
 erode estimate evaluate expand explain explore export extend extract extrapolate extrude fail fill find
 finish fit flatten follow format from generate get grade group grow guess has hold ignore import impose
-improve insert integrate interpolate interpret interrupt intersect invert is iterate join judge keep
+improve insert interpolate interpret interrupt intersect invert is iterate join judge keep
 label level limit link list listen load locate lock log lump main make mark match measure mend merge
 mesh minimise mix move multiply mute name normalise number observe open optimise orient outline pack
 paint pair parse place plan plot pool post predict prefetch prepare press preview print

@@ -42,10 +42,8 @@ class Registry(Generic[T]):
             return self._own[name]
         if name in self._added:
             return self._added[name][0]
-        raise InputError(
-            f"no {self._kind} is named {name!r}",
-            remedy=f"use {', '.join(self.names)}, or name the file that registers it in study.extensions",
-        )
+        remedy = f"use {', '.join(self.names)}, or name the file that registers it in study.extensions"
+        raise InputError(f"no {self._kind} is named {name!r}", remedy=remedy)
 
     def __iter__(self) -> Iterator[T]:
         """What is registered, limbfit's own first."""
@@ -103,12 +101,8 @@ def _run(file: Path, name: str) -> None:
 
 
 def import_extra(module: str, extra: str, refusal: InputError | None = None) -> Any:
-    """Import a module of a library that an extra of limbfit installs.
-
-    Raises
-    ------
-    InputError
-        Where it is not installed: ``refusal``, where that says better what needs it.
+    """Import a module of a library that an extra of limbfit installs. Raises `InputError` where it is not
+    installed: ``refusal``, where that says better what needs it.
     """
     try:
         return import_module(module)

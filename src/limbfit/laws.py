@@ -216,14 +216,11 @@ def register_law(law: TissueLaw) -> None:
         raise InputError("has no modulus", place=law.name, remedy='give a parameter the unit "kPa"')
     for p in law.parameters:
         if p.unit and p.unit not in UNITS:
-            raise InputError(
-                f"parameter {p.name} is in {p.unit}", place=law.name, remedy="use kPa, s or none"
-            )
+            what = f"parameter {p.name} is in {p.unit}"
+            raise InputError(what, place=law.name, remedy="use kPa, s or none")
         if not 0.0 < p.lower <= p.start <= p.upper or p.lower == p.upper:
-            raise InputError(
-                f"parameter {p.name} needs 0 < lower <= start <= upper, lower < upper",
-                place=law.name,
-            )
+            what = f"parameter {p.name} needs 0 < lower <= start <= upper, lower < upper"
+            raise InputError(what, place=law.name)
     LAWS.add(law.name, law)
 
 

@@ -27,7 +27,7 @@ from .identify.fit.calibration import CalibrationSettings
 from .identify.fit.calibration import calibrate as search
 from .identify.fit.objective import MeasuredCurve, SiteResponse
 from .identify.fit.parameters import Unknowns, group_separately
-from .identify.fit.prediction import compute_error_percent
+from .identify.fit.prediction import compute_errors_percent
 from .identify.uncertainty.noise import estimate_curve_noise
 from .identify.uncertainty.uncertainty import Uncertainty, estimate_uncertainty
 
@@ -95,18 +95,15 @@ def solve(
 ) -> Solution:
     """Simulate an indentation.
 
+    Raises `ProblemError`, before anything is solved, where the problem is impossible as stated. A simulation
+    that cannot go on is no error: the solution says ``completed = False`` and why.
+
     Parameters
     ----------
     steps : how it steps, and on how many threads; the defaults need no change.
     sensitivities : also the derivative of the force with respect to every material parameter.
     frames : keep every step with its stresses, for `Solution.to_pyvista`; without, the deepest alone.
     listener : called with every step.
-
-    Raises
-    ------
-    ProblemError
-        Before anything is solved, where the problem is impossible as stated. A simulation that cannot go on
-        is no error: the solution says ``completed = False`` and why.
     """
     announce_compilation()
     states: list[State] = []
@@ -203,6 +200,10 @@ def calibrate(
 ) -> Fit:
     """Fit parameters of tissues to measured forces or creep, with exact derivatives of the solver.
 
+    Raises `ProblemError` for parameters that the problems do not have, and curves that do not fit them, or at
+    none of whose times the first simulation has a force or a displacement, and `CalibrationError` where no
+    simulation completes at the start.
+
     Parameters
     ----------
     problems, curves : for each problem the times (n,) s and forces (n,) N that were measured, or the
@@ -214,14 +215,6 @@ def calibrate(
         times it.
     steps : how simulations step; the contact penalty is that of the first one throughout.
     listener : called with one line for each simulation of all problems.
-
-    Raises
-    ------
-    ProblemError
-        For parameters that the problems do not have, and curves that do not fit them, or at none of whose
-        times the first simulation has a force or a displacement.
-    CalibrationError
-        Where no simulation completes at the start.
     """
     cases = (problems,) if isinstance(problems, Problem) else tuple(problems)
     given = cast("Sequence[Curve]", (curves,) if isinstance(problems, Problem) else curves)
@@ -237,10 +230,7 @@ def calibrate(
     best = result.parameters
     return Fit(
         parameters=dict(zip(names, best.tolist(), strict=True)),
-        error_percent=tuple(
-            compute_error_percent(r.force_N, curve.force_N)
-            for r, curve in zip(result.responses, measured, strict=True)
-        ),
+        error_percent=compute_errors_percent(result.responses, measured),
         converged=result.stages[-1].converged,
         reason=result.stages[-1].reason,
         simulations=result.evaluations * len(cases),

@@ -68,11 +68,8 @@ def find_phases(
     changes it by no more than that is a hold. Noise of samples must be far smaller (a broken line is fitted
     to a record first, in ``traces.displacement``).
 
-    Parameters
-    ----------
-    times, displacement : (n,) s, growing, and mm, with n > 1.
-    tolerance : mm that count as nothing; ``choose_tolerance_mm`` by default.
-    contact_s : when the skin is met: all before is one ``approach``.
+    ``times``, ``displacement``: (n,) s, growing, and mm, with n > 1. ``tolerance``: mm that count as nothing;
+    ``choose_tolerance_mm`` by default. ``contact_s``: when the skin is met: all before is one ``approach``.
     """
     times, displacement = np.asarray(times, dtype=float), np.asarray(displacement, dtype=float)
     allowed = choose_tolerance_mm(displacement) if tolerance is None else tolerance

@@ -25,10 +25,8 @@ def choose_relaxation_times(first_s: float, last_s: float) -> Array:
     `InputError` if the times do not grow from above zero, or the last is more than 1e7 times the first.
     """
     if not 0.0 < first_s < last_s < math.inf or last_s > MAX_SPAN * first_s:
-        raise InputError(
-            f"relaxation times from {first_s:g} to {last_s:g} s span no range",
-            remedy=f"give two that are positive and grow, the second at most {MAX_SPAN:g} times the first",
-        )
+        remedy = f"give two that are positive and grow, the second at most {MAX_SPAN:g} times the first"
+        raise InputError(f"relaxation times from {first_s:g} to {last_s:g} s span no range", remedy=remedy)
     decades = math.log10(last_s / first_s)
     return np.geomspace(first_s, last_s, MIN_TIMES if decades <= MIN_TIMES - 1 + 1e-9 else MAX_TIMES)
 
@@ -36,10 +34,7 @@ def choose_relaxation_times(first_s: float, last_s: float) -> Array:
 def compute_power_law_terms(gamma: float, slope: float, times_s: Array) -> Array:
     """Return the amplitudes g_i (n,), dimensionless, of relaxation times (n,) in s.
 
-    Parameters
-    ----------
-    gamma : amplitude of a term at 1 s.  It belongs to the spacing of the times: with the same relaxation, it
-        is proportional to the step in ``ln tau``.
-    slope : minus the power of time.
+    ``gamma``: amplitude of a term at 1 s.  It belongs to the spacing of the times: with the same relaxation,
+    it is proportional to the step in ``ln tau``. ``slope``: minus the power of time.
     """
     return np.asarray(gamma * np.asarray(times_s, dtype=float) ** -slope)

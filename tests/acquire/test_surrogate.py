@@ -7,8 +7,9 @@ from hypothesis import strategies as st
 from in_process import SURROGATE, device, indentation
 
 from limbfit.acquire.virtual import Surrogate, VirtualLimb, fit_surrogate
-from limbfit.acquire.virtual.parts import TAUS_S, _integrate_memory, _split_depth
+from limbfit.acquire.virtual.parts import TAUS_S, _split_depth
 from limbfit.errors import TraceError
+from limbfit.traces.touchdown import compute_memory
 
 
 @pytest.mark.parametrize("power", [1.0, 1.5, 2.5])
@@ -24,7 +25,7 @@ def test_within_one_percent_of_the_simulation(power: float, speed: float) -> Non
 def follow(surrogate: Surrogate, time_s: np.ndarray, displacement_mm: np.ndarray) -> np.ndarray:
     """Forces (n,) N of a history (n,) that starts at rest, stepped as finely as it is given."""
     levels = _split_depth(displacement_mm, surrogate.depth_mm) @ np.diff(surrogate.values, axis=1).T
-    memories = [_integrate_memory(time_s, levels[:, [k]], tau)[:, 0] for k, tau in enumerate(TAUS_S, 1)]
+    memories = [compute_memory(time_s, levels[:, k], tau) for k, tau in enumerate(TAUS_S, 1)]
     return np.maximum(levels[:, 0] + np.sum(memories, axis=0), 0.0)
 
 

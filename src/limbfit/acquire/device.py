@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, Protocol
 
 from ..errors import InputError, RunError
+from ..extensions import import_extra
 from . import line_protocol as wire
 
 DEFAULT_PORT = 7714
@@ -107,11 +108,9 @@ class SerialLink(Link):
     gone = "the serial port is gone"
 
     def __init__(self, port: str, baud: int) -> None:
-        try:
-            import serial
-        except ImportError:
-            remedy = "pip install 'limbfit[serial]'"
-            raise InputError("serial ports need pyserial", place="--device", remedy=remedy) from None
+        remedy = "pip install 'limbfit[serial]'"
+        refusal = InputError("serial ports need pyserial", place="--device", remedy=remedy)
+        serial = import_extra("serial", "serial", refusal)
         try:
             super().__init__(serial.Serial(port, baud, timeout=0, write_timeout=0, exclusive=True))
         except _PORT_ERRORS as error:
@@ -143,16 +142,12 @@ def connect(address: str, timeout_s: float = 5.0) -> Link:
             return TcpLink(socket.create_connection((host, port), timeout=timeout_s))
         except (OSError, OverflowError) as error:
             reason = getattr(error, "strerror", None) or "no answer"
-            raise RunError(
-                f"no device at {host}, port {port}: {reason}; start it, or see limbfit virtual-fitsocket"
-            ) from None
+            what = f"no device at {host}, port {port}: {reason}; start it, or see limbfit virtual-fitsocket"
+            raise RunError(what) from None
     if match := _SERIAL.match(address):
         return SerialLink(match[1], int(match[2] or BAUD))
-    raise InputError(
-        "not an address of a device",
-        place="--device",
-        remedy=f"give tcp://HOST:PORT ({DEFAULT_ADDRESS}) or serial:PATH@BAUD (serial:/dev/ttyUSB0@{BAUD})",
-    )
+    remedy = f"give tcp://HOST:PORT ({DEFAULT_ADDRESS}) or serial:PATH@BAUD (serial:/dev/ttyUSB0@{BAUD})"
+    raise InputError("not an address of a device", place="--device", remedy=remedy)
 
 
 class Device(Protocol):
@@ -221,13 +216,11 @@ class LineDevice:
                     return identity
         except RunError as error:
             self._link.close()
-            raise RunError(
-                f"no greeting from the device: {error}; it takes one host at a time: does another have it?"
-            ) from None
+            what = f"no greeting from the device: {error}; it takes one host at a time: does another have it?"
+            raise RunError(what) from None
         self._link.close()
-        raise RunError(
-            f"no greeting from the device within {GREETING_S:g} s; does it speak docs/device-protocol.md?"
-        )
+        what = f"no greeting from the device within {GREETING_S:g} s; does it speak docs/device-protocol.md?"
+        raise RunError(what)
 
     def _find_identity(self, data: bytes) -> wire.Identity | None:
         """Who the device is, once it has said so; from then on lines are numbered and salted."""

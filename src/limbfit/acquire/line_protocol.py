@@ -135,12 +135,8 @@ class Decoder:
 
     def feed(self, data: bytes) -> list[Line]:
         """The lines that end in these bytes and are accepted, in order."""
-        found = []
         *ended, rest = data.split(b"\n")
-        for part in ended:
-            line = self._end_line(part)
-            if line is not None:
-                found.append(line)
+        found = [line for part in ended if (line := self._end_line(part)) is not None]
         self._buffer(rest)
         return found
 
@@ -177,13 +173,12 @@ class Decoder:
             self.refused.checksum += 1
             return None
         count = int(number)
-        if not self.numbered:
-            return Line(count, body.decode("ascii"))
-        if count <= self.last or count > MAX_NUMBER:
-            self.refused.replayed += 1
-            return None
-        self.refused.missing += count - self.last - 1
-        self.last = count
+        if self.numbered:
+            if count <= self.last or count > MAX_NUMBER:
+                self.refused.replayed += 1
+                return None
+            self.refused.missing += count - self.last - 1
+            self.last = count
         return Line(count, body.decode("ascii"))
 
 

@@ -87,19 +87,8 @@ class Phase(StrEnum):
 
 FINAL = frozenset({Phase.DONE, Phase.STOPPED, Phase.UNREACHABLE})
 WAITS_FOR_OPERATOR = frozenset({Phase.POSITION, Phase.READY})
-CLAMPED = frozenset(
-    {
-        Phase.APPROACH,
-        Phase.BACK,
-        Phase.READY,
-        Phase.SEARCH,
-        Phase.RETURN,
-        Phase.PAUSE,
-        Phase.LOAD,
-        Phase.DWELL,
-        Phase.UNLOAD,
-    }
-)
+_PHASES = list(Phase)
+CLAMPED = frozenset(_PHASES[_PHASES.index(Phase.APPROACH) : _PHASES.index(Phase.RETRACT)])
 
 _PROTOCOL_STEPS: dict[Phase, tuple[Phase, ...]] = {
     Phase.IDLE: (Phase.POSITION,),
@@ -127,14 +116,10 @@ TRANSITIONS = {phase: (*after, Phase.STOPPING) for phase, after in _PROTOCOL_STE
 class Protocol:
     """One session's state, changed by `handle` alone.
 
-    Attributes
-    ----------
-    phase : where the session is; ``reason``: why it was stopped, empty where it was not.
-    clamps : the pins that hold the limb; none where the device has one pin.
-    touch_um, start_um, depth_um : positions of the test pin, as they are found.
-    cycle : ramps begun so far, those of preconditioning included.
-
-    ``resolution_mN`` is the step of a force sensor too coarse to show its noise; 0: it shows it.
+    ``phase``: where the session is; ``reason``: why it was stopped, empty where it was not. ``clamps``: the
+    pins that hold the limb; none where the device has one pin. ``touch_um``, ``start_um``, ``depth_um``:
+    positions of the test pin, as they are found. ``cycle``: ramps begun so far, those of preconditioning
+    included. ``resolution_mN`` is the step of a force sensor too coarse to show its noise; 0: it shows it.
     """
 
     def __init__(self, settings: Settings, device: wire.Identity, resolution_mN: int = 0) -> None:

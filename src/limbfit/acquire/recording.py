@@ -171,10 +171,8 @@ def follow_recording(file: str | Path, offset: int = 0, *, every: int = 1) -> tu
     `TraceError` where it is no record, no block ends at the offset, or what follows is damaged, not only
     unfinished.
 
-    Parameters
-    ----------
-    offset : where a block ends, as an earlier call gave it; 0: from the start.
-    every : only each so many-th sample (a divisor of `ROWS_PER_BLOCK`: then they stay even over the calls).
+    ``offset``: where a block ends, as an earlier call gave it; 0: from the start. ``every``: only each so
+    many-th sample (a divisor of `ROWS_PER_BLOCK`: then they stay even over the calls).
     """
     path = Path(file)
     with add_location(file=path):
@@ -325,7 +323,9 @@ def find_ramps(recording: Recording) -> list[RecordedRamp]:
         # The rest around it belongs to a ramp; the way there and the way home do not.
         start_um = int(load.get("start_um", 0))
         position = recording.position_um[rows, pin]
-        inside = _find_near_rows(position, start_um)
+        deepest, far = int(position.argmax()), np.flatnonzero(position < start_um - 50)
+        before, beyond = far[far < deepest], far[far > deepest]
+        inside = slice(before[-1] + 1 if before.size else 0, beyond[0] if beyond.size else None)
         time = recording.device_us[rows][inside]
         trace = Trace(
             (time - time[0]) / 1e6,
@@ -334,14 +334,6 @@ def find_ramps(recording: Recording) -> list[RecordedRamp]:
         )
         found.append(RecordedRamp(int(load["cycle"]), trace))
     return found
-
-
-def _find_near_rows(position: Indices, start_um: int) -> slice:
-    """Rows from the last that is far before the deepest to the first that is far after it."""
-    deepest = int(position.argmax())
-    far = np.flatnonzero(position < start_um - 50)
-    before, after = far[far < deepest], far[far > deepest]
-    return slice(int(before[-1]) + 1 if before.size else 0, int(after[0]) if after.size else len(position))
 
 
 def check_record(recording: Recording) -> Verdict:
@@ -360,6 +352,7 @@ def check_record(recording: Recording) -> Verdict:
 
 
 def _check_curves(counted: list[RecordedRamp], speed_mm_s: float) -> list[Check]:
+    low, high = speed_mm_s * (1.0 - SPEED_TOLERANCE), speed_mm_s * (1.0 + SPEED_TOLERANCE)
     smooth: list[RegularisedCurve] = []
     checks = []
     for ramp in counted:
@@ -370,22 +363,15 @@ def _check_curves(counted: list[RecordedRamp], speed_mm_s: float) -> list[Check]
             checks.append(Check("touch-down", False, f"none is found: {error.what}", "record the site again"))
             continue
         smooth.append(curve)
-        checks += [_check_speed(curve, speed_mm_s), _check_touch(touch.displacement_mm, touch.uncertainty_mm)]
+        speeds = (curve.speed_load_mm_s, curve.speed_unload_mm_s)
+        found = f"{speeds[0]:.3f} mm/s in, {speeds[1]:.3f} mm/s out ({low:.3g} to {high:.3g})"
+        remedy = "see acquire.ramp_speed_mm_s, and the device's drive"
+        checks.append(Check("speed", all(low <= speed <= high for speed in speeds), found, remedy))
+        place, sd = touch.displacement_mm, touch.uncertainty_mm
+        found = f"{place:.2f} +- {sd:.2f} mm from the start (at most {MAX_TOUCH_SD_MM:g})"
+        remedy = "give the ramps a larger acquire.start_gap_mm, or clean the force sensor"
+        checks.append(Check("touch-down", sd <= MAX_TOUCH_SD_MM, found, remedy))
     return [*checks, _check_repeatability(smooth)]
-
-
-def _check_speed(curve: RegularisedCurve, stated_mm_s: float) -> Check:
-    low, high = stated_mm_s * (1.0 - SPEED_TOLERANCE), stated_mm_s * (1.0 + SPEED_TOLERANCE)
-    speeds = (curve.speed_load_mm_s, curve.speed_unload_mm_s)
-    found = f"{speeds[0]:.3f} mm/s in, {speeds[1]:.3f} mm/s out ({low:.3g} to {high:.3g})"
-    remedy = "see acquire.ramp_speed_mm_s, and the device's drive"
-    return Check("speed", all(low <= speed <= high for speed in speeds), found, remedy)
-
-
-def _check_touch(place_mm: float, uncertainty_mm: float) -> Check:
-    found = f"{place_mm:.2f} +- {uncertainty_mm:.2f} mm from the start (at most {MAX_TOUCH_SD_MM:g})"
-    remedy = "give the ramps a larger acquire.start_gap_mm, or clean the force sensor"
-    return Check("touch-down", uncertainty_mm <= MAX_TOUCH_SD_MM, found, remedy)
 
 
 def _check_repeatability(curves: list[RegularisedCurve]) -> Check:

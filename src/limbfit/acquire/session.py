@@ -131,9 +131,8 @@ class Session:
                 case wire.LimitTrip(code=code, pin=pin):
                     self._record("fault", now, code=code, pin=pin)
                     where = f", pin {pin}" if pin else ""
-                    self.handle(
-                        Abort(f"the device stopped by itself: {code}{where}{_explain_code(code)}"), now
-                    )
+                    reason = f"the device stopped by itself: {code}{where}{_explain_code(code)}"
+                    self.handle(Abort(reason), now)
                 case wire.StuckPins(pins=pins):
                     self.unreachable = tuple(k + 1 for k in range(pins.bit_length()) if pins >> k & 1)
                     self._record("unreachable", now, pins=list(self.unreachable))
@@ -151,11 +150,8 @@ class Session:
     def tick(self, now: float) -> None:
         """Check the watchdog, and repeat commands that went unanswered."""
         protocol = self.protocol
-        if (
-            not self.device.identity.is_paced
-            and protocol.phase is not Phase.STOPPING
-            and not protocol.is_over
-        ):
+        has_ended = protocol.is_over or protocol.phase is Phase.STOPPING
+        if not (has_ended or self.device.identity.is_paced):
             silent = now - self._last_fresh_s
             if silent * 1000 > self.settings.watchdog_ms:
                 self.handle(Abort(f"no fresh sample for {silent * 1000:.0f} ms"), now)

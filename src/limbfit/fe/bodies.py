@@ -121,13 +121,14 @@ class Bodies:
         self.levers = np.zeros((first, 3, column))
         frames = [np.broadcast_to(b.frame, (b.surface.areas.size, 3, 3)) for b in self.all]
         self.frames = np.concatenate(frames or [np.zeros((0, 3, 3))])
-        shares = []  # (unknowns, 3 c) of the unknowns in the position of every contact point
+        shares = []
         for body in self.all:
             whole = sp.kron(body.surface.shares, sp.eye(3), format="csr")
             own = whole[np.flatnonzero(pattern.numbers[: self.nodes].ravel() >= 0)]
             own.resize(self.unknowns, whole.shape[1])  # the coordinates of bodies are the last unknowns
             shares.append(own)
-        self._spread = sp.hstack(shares or [sp.csr_matrix((self.unknowns, 0))], format="csr")
+        # (unknowns, 3 c) of the unknowns in the position of every contact point.
+        self.shares = sp.hstack(shares or [sp.csr_matrix((self.unknowns, 0))], format="csr")
         self._positions = [find_positions(b.surface.faces, pattern.numbers, pattern.indptr, pattern.indices)
                            for b in self.all]  # fmt: skip
         # Where the entries of the bodies' coordinates are in the matrix.
@@ -251,7 +252,7 @@ class Bodies:
 
     def _add_border(self, columns: Array, corner: Array, data: Array) -> None:
         """Add what points feel of the coordinates (c, 3, k), and coordinates of each other (k, k)."""
-        beside = self._spread @ columns.reshape(-1, self.free)
+        beside = self.shares @ columns.reshape(-1, self.free)
         for values, (rows, own, places) in ((beside, self._beside), (corner, self._corner)):
             data[places] += values[rows, own]
 
@@ -269,16 +270,9 @@ class Bodies:
         """What forces (c, 3, p) on the points ask of the first body along its axis (p,), N."""
         return -np.einsum("i,cip->p", self.first_body.frame[2], forces[self.first_body.points])
 
-    def select_shares(self, unknowns: Index) -> sp.csr_matrix:
-        """Shares (m, 3 c) of some unknowns in the contact points, for `spread_forces` and `move_springs`.
-
-        Where bodies are free, their coordinates are the last of these unknowns.
-        """
-        return self._spread[unknowns]
-
     def spread_forces(self, forces: Array, shares: sp.csr_matrix | None = None) -> Array:
         """Forces (c, 3, ...) at the contact points as a vector (or matrix) of the unknowns, or of some."""
-        shares = self._spread if shares is None else shares
+        shares = self.shares if shares is None else shares
         out = np.asarray(shares @ forces.reshape(-1, *forces.shape[2:]))
         if self.free:
             out[-self.free :] += np.einsum("cik,ci...->k...", self.levers, forces)
@@ -287,7 +281,7 @@ class Bodies:
     def move_springs(self, x: Array, shares: sp.csr_matrix | None = None) -> Array:
         """Values (c, 3, ...) of a vector (or matrix) of the unknowns, or of some, at the contact points,
         relative to the bodies."""
-        shares = self._spread if shares is None else shares
+        shares = self.shares if shares is None else shares
         out = np.asarray(shares.T @ x).reshape(-1, 3, *x.shape[1:])
         if self.free:
             out += np.einsum("cik,k...->ci...", self.levers, x[-self.free :])
@@ -301,7 +295,7 @@ class Bodies:
                 value, forced, growth = motion.at(t)
                 tool = body.tool(rest, np.where(forced, 0.0, value), growth)
                 under[body.points] |= tool.gaps.ravel() < NEAR_GAP * body.start.width
-        touched = np.diff(self._spread[:, np.repeat(under, 3)].indptr) > 0
+        touched = np.diff(self.shares[:, np.repeat(under, 3)].indptr) > 0
         touched[self.unknowns - self.free :] = touched.any()
         return np.flatnonzero(touched).astype(np.int32)
 
@@ -309,7 +303,7 @@ class Bodies:
         """Contact points (c,) that move with these unknowns alone; none where there are none."""
         others = np.ones(self.unknowns)
         others[unknowns] = 0.0
-        alone = (self._spread.T @ others).reshape(-1, 3) == 0.0
+        alone = (self.shares.T @ others).reshape(-1, 3) == 0.0
         return alone.all(axis=1) & (len(unknowns) > 0)
 
     def evaluate_drives(self, u: Array, drives: Drives, penalty: float) -> tuple[float, Array, float]:
@@ -370,7 +364,6 @@ def _place_start(problem: Problem, stated: RigidBody, surface: ContactSurface) -
     offset = find_touching_offset(surface, stated.shape)
     start = stated.shape.move(offset)
     if abs(surface.gaps_at_rest(start).min()) > 1e-6:
-        raise ProblemError(
-            "the indenter never meets the contact faces", remedy="check its centre, axis and the faces"
-        )
+        what = "the indenter never meets the contact faces"
+        raise ProblemError(what, remedy="check its centre, axis and the faces")
     return start

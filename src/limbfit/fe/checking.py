@@ -45,9 +45,8 @@ def _check_choices(problem: Problem) -> None:
     missing = [region for region in mesh.region_names if region not in problem.materials]
     if missing:
         given = ", ".join(problem.materials) or "none"
-        raise ProblemError(
-            f"region {missing[0]!r} has no material", remedy=f"name it in materials; there are: {given}"
-        )
+        what = f"region {missing[0]!r} has no material"
+        raise ProblemError(what, remedy=f"name it in materials; there are: {given}")
     if mesh.regions.size and (mesh.regions.min() < 0 or mesh.regions.max() >= len(mesh.region_names)):
         raise ProblemError("the mesh has region indices without a name")
     if problem.contact_rule not in ELEMENTS[name].face_rules:
@@ -63,13 +62,11 @@ def _check_friction(friction: str | float, sticking: str) -> None:
     else:
         known = not isinstance(friction, bool) and 0.0 <= friction < np.inf
     if not known:
-        raise ProblemError(
-            f"unknown friction {friction!r}", remedy="use 'frictionless', 'sticky' or a coefficient from 0 on"
-        )
+        what = f"unknown friction {friction!r}"
+        raise ProblemError(what, remedy="use 'frictionless', 'sticky' or a coefficient from 0 on")
     if sticking not in LAWS_OF_STICKING:
-        raise ProblemError(
-            f"unknown law of sticking {sticking!r}", remedy=f"use {' or '.join(map(repr, LAWS_OF_STICKING))}"
-        )
+        what = f"unknown law of sticking {sticking!r}"
+        raise ProblemError(what, remedy=f"use {' or '.join(map(repr, LAWS_OF_STICKING))}")
 
 
 def _measure_cells(problem: Problem) -> Array:
@@ -87,20 +84,17 @@ def _check_fibres(problem: Problem) -> None:
     for region in problem.mesh.region_names:
         table = problem.materials[region].table()
         if problem.activation is None and table.active > 0.0:
-            raise ProblemError(
-                f"the active stress of {region!r} acts at no stated time", remedy="state Problem.activation"
-            )
+            what = f"the active stress of {region!r} acts at no stated time"
+            raise ProblemError(what, remedy="state Problem.activation")
         if problem.fibres is None and table.has_fibres:
-            raise ProblemError(
-                f"the fibres of {region!r} have no direction", remedy="state fibres, (3,) or (cells, 3)"
-            )
+            what = f"the fibres of {region!r} have no direction"
+            raise ProblemError(what, remedy="state fibres, (3,) or (cells, 3)")
     if problem.fibres is None:
         return
     given = np.asarray(problem.fibres, dtype=float)
     if given.shape not in ((3,), (len(problem.mesh.cells), 3)):
-        raise ProblemError(
-            f"fibres have shape {given.shape}", remedy=f"give (3,), or ({len(problem.mesh.cells)}, 3)"
-        )
+        what = f"fibres have shape {given.shape}"
+        raise ProblemError(what, remedy=f"give (3,), or ({len(problem.mesh.cells)}, 3)")
     if not (np.isfinite(given).all() and (np.linalg.norm(np.atleast_2d(given), axis=1) > 0.0).all()):
         raise ProblemError("a direction of the fibres is zero or not finite")
 
@@ -110,16 +104,13 @@ def _check_prestretch(problem: Problem) -> None:
         return
     given, cells = np.asarray(problem.prestretch, dtype=float), len(problem.mesh.cells)
     if given.shape not in ((3, 3), (1, 3, 3), (cells, 3, 3)):
-        raise ProblemError(
-            f"a pre-stretch has shape {given.shape}", remedy=f"give (3, 3), or ({cells}, 3, 3)"
-        )
+        what = f"a pre-stretch has shape {given.shape}"
+        raise ProblemError(what, remedy=f"give (3, 3), or ({cells}, 3, 3)")
     if not (np.isfinite(given).all() and (np.linalg.det(given) > 0.0).all()):
         raise ProblemError("a pre-stretch is not finite, or its determinant is not positive")
     if problem.indenter is not None and problem.start == "touching" and problem.history.forced:
-        raise ProblemError(
-            "an indenter that touches pre-strained tissue is driven by displacement",
-            remedy='state where it starts, start="as-given"',
-        )
+        what = "an indenter that touches pre-strained tissue is driven by displacement"
+        raise ProblemError(what, remedy='state where it starts, start="as-given"')
 
 
 def _check_bodies(problem: Problem) -> None:
@@ -130,20 +121,17 @@ def _check_bodies(problem: Problem) -> None:
             raise ProblemError(f"contact faces{of} have shape {faces.shape}, not (f, {width}) with f > 0")
         _check_friction(body.friction, body.sticking)
         if body.motion.grows and not body.shape.grows:
-            raise ProblemError(
-                f"the shape{of or ' of the body'} does not grow",
-                remedy="give a SmoothSurface with a clear shape, or a growth of 1",
-            )
+            what = f"the shape{of or ' of the body'} does not grow"
+            raise ProblemError(what, remedy="give a SmoothSurface with a clear shape, or a growth of 1")
     for one in problem.pressures:
         if np.asarray(one.faces).ndim != 2 or np.asarray(one.faces).shape[1] != width:
             raise ProblemError(f"pressed faces have shape {np.asarray(one.faces).shape}, not (f, {width})")
     end = problem.history.times[-1]
     for i, body in enumerate(problem.bodies):
         if np.isnan(body.motion.values[0]).any():
-            raise ProblemError(
-                f"the motion of {body.name or f'body {i}'} leaves open with which force it begins",
-                remedy="state it; only a coordinate that was held before may take over its force",
-            )
+            what = f"the motion of {body.name or f'body {i}'} leaves open with which force it begins"
+            remedy = "state it; only a coordinate that was held before may take over its force"
+            raise ProblemError(what, remedy=remedy)
         if body.motion.times[-1] < end * (1.0 - 1e-9):
             raise ProblemError(
                 f"the motion of {body.name or f'body {i}'} ends at {body.motion.times[-1]:g} s, before the "
@@ -162,9 +150,7 @@ def _check_touch_down(problem: Problem) -> None:
     if not 0.0 < at < history.times[-1]:
         raise ProblemError(f"a touch-down at {at:g} s is not within the history, to {history.times[-1]:g} s")
     if problem.indenter is None or problem.start != "touching" or history.forced:
-        raise ProblemError(
-            "a later touch-down is that of an indenter driven by displacement that starts touching",
-            remedy="leave touch_down_s out",
-        )
+        what = "a later touch-down is that of an indenter driven by displacement that starts touching"
+        raise ProblemError(what, remedy="leave touch_down_s out")
     if np.ptp(np.append(history.driver[history.times < at], history.at(at))) > 0.0:
         raise ProblemError(f"the indenter advances before its touch-down at {at:g} s")

@@ -22,12 +22,10 @@ Points = System | EvaluationPoints  # those with a past of their own
 class Memory:
     """What the tissue keeps of its past at the quadrature points, MPa.
 
-    Parameters
-    ----------
-    elastic : (m, q, 6) deviatoric second Piola-Kirchhoff stress Se.
-    prony : (l, m, q, 6) history H of each Prony term.
-    before, duration : Se one step earlier and how long that step was, s; None and infinite where the next
-        step takes the stress as linear in time: at rest, and where the indenter has just turned.
+    ``elastic``: (m, q, 6) deviatoric second Piola-Kirchhoff stress Se. ``prony``: (l, m, q, 6) history H of
+    each Prony term. ``before``, ``duration``: Se one step earlier and how long that step was, s; None and
+    infinite where the next step takes the stress as linear in time: at rest, and where the indenter has just
+    turned.
     """
 
     elastic: Array

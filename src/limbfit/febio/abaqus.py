@@ -39,10 +39,8 @@ def write_inp(problem: Problem, path: str | Path, program: str, settings: FebSet
     for name in problem.mesh.region_names:
         _check_material(name, problem.materials[name], program)
     if program == "calculix" and problem.mesh.cell_type == "hex8":
-        raise ProblemError(
-            "CalculiX's hexahedra lock in nearly incompressible tissue: twice the force",
-            remedy="give a mesh of quadratic tetrahedra",
-        )
+        what = "CalculiX's hexahedra lock in nearly incompressible tissue: twice the force"
+        raise ProblemError(what, remedy="give a mesh of quadratic tetrahedra")
     system = System(problem)
     assert system.indenter is not None
     tool = build_indenter_mesh(system.indenter)
@@ -57,10 +55,8 @@ def _check_material(name: str, material: Material, program: str) -> None:
     if table.has_fibres:
         raise ProblemError(f"tissue {name!r} has fibres, which are written for FEBio only")
     if program == "calculix" and any(g != 0.0 for g, _ in table.prony):
-        raise ProblemError(
-            f"tissue {name!r} relaxes, which CalculiX cannot do at finite strain",
-            remedy="export with --parameters whose gamma is 0, for FEBio or for Abaqus",
-        )
+        what = f"tissue {name!r} relaxes, which CalculiX cannot do at finite strain"
+        raise ProblemError(what, remedy="export with --parameters whose gamma is 0, for FEBio or for Abaqus")
     if program == "calculix" and len(table.terms) > 3:
         raise ProblemError(f"tissue {name!r} has more than the 3 Ogden terms of CalculiX")
     if table.volumetric not in (0, 2):

@@ -47,10 +47,8 @@ def to_space(name: str, motion: Motion, frame: Array) -> Motion:
     if motion.grows:
         raise ProblemError(f"{name}: a body that grows is not written for FEBio, which has none")
     if np.isnan(motion.values).any():
-        raise ProblemError(
-            f"{name}: a force that takes over what held the body is not written for FEBio",
-            remedy="state the force, as Result.reactions tell it",
-        )
+        what = f"{name}: a force that takes over what held the body is not written for FEBio"
+        raise ProblemError(what, remedy="state the force, as Result.reactions tell it")
     turn, forced = np.kron(np.eye(2), frame), np.asarray(motion.forced)
     own = forced.copy()
     for block in (slice(0, 3), slice(3, 6)):
@@ -59,17 +57,14 @@ def to_space(name: str, motion: Motion, frame: Array) -> Motion:
             continue
         main = np.abs(frame).argmax(axis=0)  # of each axis of space, that of the frame
         if not np.allclose(np.abs(frame[main, range(3)]), 1.0, atol=1e-12):
-            raise ProblemError(
-                f"{name}: a force along an axis that lies between x, y and z is not written for FEBio",
-                remedy="turn the problem first (limbfit.febio.turn_to_indenter_frame)",
-            )
+            what = f"{name}: a force along an axis that lies between x, y and z is not written for FEBio"
+            raise ProblemError(what, remedy="turn the problem first (limbfit.febio.turn_to_indenter_frame)")
         own[:, block] = forced[:, block][:, main]
     values = motion.values @ turn
     values[:, :3] = np.where(np.abs(values[:, :3]) < 1e-15 * np.abs(values).max(), 0.0, values[:, :3])
     if not has_same_rotation(values, own):
-        raise ProblemError(
-            f"{name}: a turn about several axes is not written for FEBio, which adds it up another way"
-        )
+        what = f"{name}: a turn about several axes is not written for FEBio, which adds it up another way"
+        raise ProblemError(what)
     return Motion(motion.times, values, own)
 
 

@@ -63,10 +63,8 @@ class FacePenalties:
     penalty of `compute_mean_penalty` acts as FEBio's does; `update_after` extrapolates the area of the next
     step from those of the last two. The contact area of the result then has no meaning.
 
-    Parameters
-    ----------
-    contacts : that of every rigid body of the problem, in their order.
-    times : (k,) s, the steps that will be taken.
+    ``contacts``: that of every rigid body of the problem, in their order; ``times``: (k,) s, the steps that
+    will be taken.
     """
 
     def __init__(self, system: System, contacts: Sequence[Contact], times: Array) -> None:

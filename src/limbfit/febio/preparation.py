@@ -60,10 +60,8 @@ def prepare_problem(problem: Problem, steps: StepControl) -> tuple[Problem, tupl
 
     Raises `ProblemError` if these places are not found.
 
-    Parameters
-    ----------
-    steps : step control with which limbfit finds where the indenter touches, and where bodies under a force
-        are at the end of the first step.
+    ``steps``: step control with which limbfit finds where the indenter touches, and where bodies under a
+    force are at the end of the first step.
     """
     preparation, waits = Preparation.from_problem(problem), IndenterStart.from_problem(problem).waits
     motions = [body.motion for body in problem.rigid_bodies]

@@ -42,9 +42,7 @@ def to_problem(model: FebModel, indenter: Indenter | None = None, **settings: An
     Raises `ProblemError` if the input has no deformable part, several element types, or motions that are not
     one history.
 
-    Parameters
-    ----------
-    settings : further fields of `Problem` (``element``, ``contact_rule``, ..).
+    ``settings``: further fields of `Problem` (``element``, ``contact_rule``, ..).
     """
     tissue, driven = build_tissue(model), find_drive(model, shaped=indenter is not None)
     touching, name = group_contacts(model), driven.indenter
@@ -270,9 +268,7 @@ def find_drive(model: FebModel, shaped: bool = False) -> Drive:
     Raises `ProblemError` if nodes, or bodies that carry tissue, move by load curves that are not
     multiples of one another, and for motions that limbfit does not support.
 
-    Parameters
-    ----------
-    shaped : True if a shape is given for the body that goes straight in, whose own faces may then be open.
+    ``shaped``: True if a shape is given for the body that goes straight in, whose own faces may then be open.
     """
     touching, motions = group_contacts(model), _read_body_motions(model)
     bodies = {name: motions[name] for name in touching}
@@ -338,11 +334,9 @@ def _read_body_motions(model: FebModel) -> dict[str, Motion]:
         place = f"line {body.line}, <material>"
         if name in model.carried_nodes and motion.free.any():
             freedoms = ", ".join(f"R{letter}" for letter, free in zip(FREEDOMS, motion.free) if free)
-            raise ProblemError(
-                f"the rigid body {name!r} is neither fixed nor displaced in {freedoms}",
-                place=place,
-                remedy="limbfit solves only for bodies that carry no tissue: fix it there with rigid_fixed",
-            )
+            what = f"the rigid body {name!r} is neither fixed nor displaced in {freedoms}"
+            remedy = "limbfit solves only for bodies that carry no tissue: fix it there with rigid_fixed"
+            raise ProblemError(what, place=place, remedy=remedy)
         lines = [c.line for c in model.conditions if c.body == name and c.kind != "fixed" and c.curve]
         if name in model.carried_nodes and motion.values[:, 3:].any():
             what = f"the rigid body {name!r} carries tissue, and turns: that is not supported"
@@ -390,9 +384,7 @@ def _find_factor(course: _FollowingCurve, times: Array, history: Array) -> float
     values = course.at(times)
     scale = float(values @ history / (history @ history))
     if np.abs(values - scale * history).max() > 1e-9 * np.abs(values).max():
-        raise ProblemError(
-            f"{course.words} is not a multiple of that of the other motions",
-            place=f"line {course.line}",
-            remedy="limbfit moves nodes, and bodies that carry tissue, by one history",
-        )
+        what = f"{course.words} is not a multiple of that of the other motions"
+        remedy = "limbfit moves nodes, and bodies that carry tissue, by one history"
+        raise ProblemError(what, place=f"line {course.line}", remedy=remedy)
     return scale

@@ -53,9 +53,8 @@ def find_febio(program: str | Path | None = None, folder: Path = Path()) -> Path
         if given:
             found = shutil.which(str(given))
             if found is None:
-                raise InputError(
-                    "is not a program that can be run", file=given, place=name, remedy=INSTALL_REMEDY
-                )
+                what = "is not a program that can be run"
+                raise InputError(what, file=given, place=name, remedy=INSTALL_REMEDY)
             return Path(found).absolute()  # it is run in another folder
     for candidate in filter(None, map(shutil.which, PROGRAM_NAMES)):
         return Path(candidate)
@@ -69,10 +68,8 @@ def run_febio(
 
     Raises `RunError` if the program cannot be started, or the folder cannot be written.
 
-    Parameters
-    ----------
-    end_s : the time that the input asks for, s.
-    table : name of the log-file table that holds the indenter's force.
+    ``end_s``: the time that the input asks for, s; ``table``: name of the log-file table that holds the
+    indenter's force.
     """
     output = folder / OUTPUT
     try:
@@ -148,10 +145,8 @@ def build_result(problem: Problem, log: FebioLog | None, verdict: RunVerdict, se
     if not len(times) or times[0] > 0.0:  # FEBio did not come so far, or has not written the beginning
         times, force, moved = (np.append(0.0, column) for column in (times, force, moved))
     if times[-1] > problem.history.times[-1] * (1.0 + TIME_TOLERANCE):
-        raise ProblemError(
-            f"the table goes on to {times[-1]:.4g} s, the indentation to {problem.history.times[-1]:.4g} s",
-            remedy="give the table of the same indentation",
-        )
+        what = f"the table goes on to {times[-1]:.4g} s, the indentation to {problem.history.times[-1]:.4g} s"
+        raise ProblemError(what, remedy="give the table of the same indentation")
     unknown, reactions = np.full(len(times), np.nan), np.full((len(times), 1, 6), np.nan)
     reactions[:, 0, 2] = force
     return Result(
@@ -221,12 +216,9 @@ def judge_run(
 ) -> RunVerdict:
     """Judge a run by its exit, its messages and its log.
 
-    Parameters
-    ----------
-    messages : what FEBio wrote on standard output (its log file says the same).
-    exit_code : of the process; negative or above 128 for a signal.
-    end_s : time that the input asks for.
-    timed_out, limit_s : whether it was stopped by the time limit, and after how many seconds.
+    ``messages``: what FEBio wrote on standard output (its log file says the same). ``exit_code``: of the
+    process; negative or above 128 for a signal. ``end_s``: time that the input asks for. ``timed_out``,
+    ``limit_s``: whether it was stopped by the time limit, and after how many seconds.
     """
     found = _VERSION.search(messages)
     version = found.group(1) if found else ""
@@ -313,9 +305,8 @@ def read_log(path: str | Path) -> FebioLog:
             elif line.strip() and not line.startswith("*"):
                 steps[-1].append([float(value) for value in line.split(",")[1:]])
         except (ValueError, IndexError) as error:
-            raise ProblemError(
-                f"{line!r} is not a line of a FEBio log", file=path, place=str(number)
-            ) from error
+            what = f"{line!r} is not a line of a FEBio log"
+            raise ProblemError(what, file=path, place=str(number)) from error
     items = len(steps[0]) if steps else 0
     whole = [[len(row) for row in step] == [len(names)] * items for step in steps]
     count = whole.index(False) if False in whole else len(whole)

@@ -45,11 +45,9 @@ def run_feb(
     Raises `ProblemError` if the input cannot be read or holds what limbfit does not support, with its line,
     and `RunError` if the tables cannot be written.
 
-    Parameters
-    ----------
-    on_step : called with every accepted step and the time of the last one, s.
-    keep : refuse to write over existing files.
-    settings : fields of `StepControl` that replace what the input says (``times``, ``threads``, ..).
+    ``on_step``: called with every accepted step and the time of the last one, s; ``keep``: refuse to write
+    over existing files; ``settings``: fields of `StepControl` that replace what the input says (``times``,
+    ``threads``, ..).
     """
     folder = Path(output)
     with add_location(file=path):

@@ -11,7 +11,7 @@ Source: FEBio User Manual 4.0, chapter 4, and the section on ``MeshData``; ``FEA
 """
 
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
@@ -59,13 +59,10 @@ MAX_TERMS = 6  # of Ogden and of Prony in FEBio
 class FebSettings:
     """What FEBio needs and limbfit does not.
 
-    Parameters
-    ----------
-    penalty : multiple of FEBio's automatic penalty (above 3, tet10 retry or stall); None: an explicit one as
-        stiff as limbfit's contact.
-    steps : limbfit's step control, whose times FEBio must meet and whose penalty is the explicit one.
-    force_file : name of the table of the indenter's force and position.
-    title : one line in the head of the file.
+    ``penalty``: multiple of FEBio's automatic penalty (above 3, tet10 retry or stall); None: an explicit one
+    as stiff as limbfit's contact. ``steps``: limbfit's step control, whose times FEBio must meet and whose
+    penalty is the explicit one. ``force_file``: name of the table of the indenter's force and position.
+    ``title``: one line in the head of the file.
     """
 
     penalty: float | None = None
@@ -350,25 +347,20 @@ def format_row(values: Iterable[float]) -> str:
     return ",".join(repr(float(value)) for value in values)
 
 
-def format_fields(values: Iterable[float]) -> str:
-    """Write numbers with commas, each in the 20 characters that Abaqus and CalculiX take at most."""
-    return ", ".join(f"{float(value):.12g}" for value in values)
-
-
-def format_ids(nodes: Iterable[int]) -> str:
-    """Write nodes as FEBio's numbers, which count from 1."""
-    return ",".join(str(int(node) + 1) for node in nodes)
-
-
 def wrap_numbers(numbers: Iterable[int]) -> str:
     """Write at most 15 numbers in a line, as Abaqus asks; a line that continues ends with a comma."""
     listed = [str(int(number)) for number in numbers]
     return ",\n".join(", ".join(listed[i : i + 15]) for i in range(0, len(listed), 15))
 
 
-def find_across(direction: Array) -> Array:
-    """Return the axis of space (3,) that is most across a direction (3,)."""
-    return np.asarray(np.eye(3)[np.argmin(np.abs(direction))])
+_FILTERS: dict[str, Callable[[Any], Any]] = {  # of the templates
+    "row": format_row,
+    # With commas, each in the 20 characters that Abaqus and CalculiX take at most.
+    "fields": lambda values: ", ".join(f"{float(value):.12g}" for value in values),
+    "ids": lambda nodes: ",".join(str(int(node) + 1) for node in nodes),  # FEBio's count from 1
+    "wrap": wrap_numbers,
+    "across": lambda direction: np.eye(3)[np.argmin(np.abs(direction))],  # the axis of space most across it
+}
 
 
 def write_template(path: str | Path, template: str, **content: Any) -> None:
@@ -381,8 +373,7 @@ def write_template(path: str | Path, template: str, **content: Any) -> None:
         lstrip_blocks=True,
         keep_trailing_newline=True,
     )
-    environment.filters |= {"row": format_row, "fields": format_fields, "ids": format_ids}
-    environment.filters |= {"wrap": wrap_numbers, "across": find_across}
+    environment.filters |= _FILTERS
     text = environment.get_template(template).render(content)
     try:
         Path(path).write_text(text, encoding="utf-8")

@@ -212,11 +212,7 @@ def _compute_tibia(shape: Shank, points: Floats) -> Floats:
     )
     medial = compute_surface_point(shape, np.full_like(z, 0.92), section_z, shape.medial_depth + depth)
     lateral = 0.38 * compute_surface_point(shape, np.full_like(z, -0.25), np.maximum(section_z, shape.dome))
-    corners = (
-        blend(crest, (0.0, -20.0)),
-        blend(medial, (23.0, 4.0)),
-        blend(lateral, (-21.0, 2.0)),
-    )
+    corners = (blend(crest, (0.0, -20.0)), blend(medial, (23.0, 4.0)), blend(lateral, (-21.0, 2.0)))
     section = compute_triangle_distance(x, y, corners) - rounding
     return extrude_section(section, z, shape.pad, shape.joint - shape.joint_gap / 2, 4.0)
 
@@ -398,10 +394,7 @@ class Limb:
 
 
 def make_limb(
-    seed: int,
-    layers: tuple[LayerSpec, ...] = SKIN_LAYER,
-    tendon: bool = False,
-    kind: str = "transtibial",
+    seed: int, layers: tuple[LayerSpec, ...] = SKIN_LAYER, tendon: bool = False, kind: str = "transtibial"
 ) -> Limb:
     """The limb of a seed: its shape, lying 8 to 14 degrees off the patient axes, under some layers. Raises
     `InputError` for a limb that is none of ``LIMBS``, or a patellar tendon of one that has none.

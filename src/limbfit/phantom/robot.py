@@ -87,10 +87,7 @@ THIGH_PLACES = (
     *_build_places("posterior", 7.0, 14, [(np.pi + aside, below) for aside, below in _COLUMN]),
 )
 FITTED = ("01", "05", "10", "15")
-DETAIL_SITES = {
-    "coarse": (*FITTED, "13", "17"),
-    "paper": tuple(place.name for place in SHANK_PLACES),
-}
+DETAIL_SITES = {"coarse": (*FITTED, "13", "17"), "paper": tuple(place.name for place in SHANK_PLACES)}
 
 
 @dataclass(frozen=True)
@@ -102,9 +99,8 @@ class Ramp:
 
     def __post_init__(self) -> None:
         if not (self.depth > 0 and self.speed > 0):
-            raise SiteError(
-                f"cannot indent {self.depth:g} mm at {self.speed:g} mm/s", remedy="give positive numbers"
-            )
+            what = f"cannot indent {self.depth:g} mm at {self.speed:g} mm/s"
+            raise SiteError(what, remedy="give positive numbers")
 
     @property
     def peak_s(self) -> float:
@@ -155,9 +151,8 @@ def select_sites(sites: Sequence[TrueSite], names: Sequence[str]) -> tuple[TrueS
     available = {site.name for site in sites}
     unknown = [name for name in names if name not in available]
     if unknown:
-        raise SiteError(
-            f"the phantom has no site {unknown[0]!r}", remedy=f"choose from {', '.join(sorted(available))}"
-        )
+        what = f"the phantom has no site {unknown[0]!r}"
+        raise SiteError(what, remedy=f"choose from {', '.join(sorted(available))}")
     found = [site for site in sites if site.name in set(names)]
     unfitted = not any(site.fitted for site in found)
     return tuple(replace(site, fitted=site.fitted or unfitted) for site in found)
@@ -234,11 +229,8 @@ class RobotRecord:
 def record(ramp: Ramp, force: Callable[[Array], Array], random: np.random.Generator) -> RobotRecord:
     """Record an indentation.
 
-    Parameters
-    ----------
-    ramp : depth and speed from touch-down.
-    force : force (n,) in N at times (n,) from touch-down, within ``[0, 2 ramp.peak_s]``.
-    random : source of clearance and noise.
+    ``ramp``: depth and speed from touch-down; ``force``: force (n,) in N at times (n,) from touch-down,
+    within ``[0, 2 ramp.peak_s]``; ``random``: source of clearance and noise.
     """
     clearance = random.uniform(*CLEARANCE_MM)
     sd = random.uniform(*FORCE_NOISE_N)
@@ -280,11 +272,7 @@ def write_ultrasound(
 
 
 def write_surface(
-    path: Path,
-    made: RobotRecord,
-    points: Array,
-    moves: Callable[[Array], Array],
-    random: np.random.Generator,
+    path: Path, made: RobotRecord, points: Array, moves: Callable[[Array], Array], random: np.random.Generator
 ) -> None:
     """Write what cameras saw of the skin around the indenter: positions at rest and displacements, at 5 Hz.
 
@@ -302,10 +290,7 @@ def write_surface(
 
 
 def write_waves(
-    path: Path,
-    made: RobotRecord,
-    speeds: Mapping[str, Callable[[Array], Array]],
-    random: np.random.Generator,
+    path: Path, made: RobotRecord, speeds: Mapping[str, Callable[[Array], Array]], random: np.random.Generator
 ) -> None:
     """Write what elastography through the indenter read of a record: speeds of shear waves, m/s, at 1 Hz.
 

@@ -118,11 +118,8 @@ def _fit_line_turning_at(peak_s: float, line: BrokenLine, t: Array, u: Array) ->
         line_at_peak = BrokenLine(knots, _fit_values(t, u, knots)[0], line.tolerance)
         if line_at_peak.peak_s == peak_s:
             return line_at_peak
-    raise TraceError(
-        f"the way in cannot end at {peak_s:g} s",
-        place="peak_s",
-        remedy=f"the record turns at {line.peak_s:.3f} s; stay near it, between {low:.3f} and {high:.3f} s",
-    )
+    remedy = f"the record turns at {line.peak_s:.3f} s; stay near it, between {low:.3f} and {high:.3f} s"
+    raise TraceError(f"the way in cannot end at {peak_s:g} s", place="peak_s", remedy=remedy)
 
 
 def _fit_values(t: Array, u: Array, knots: Array) -> tuple[Array, Array]:

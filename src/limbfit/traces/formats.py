@@ -33,12 +33,9 @@ Row = tuple[int, list[str]]  # the number of a line, and its cells
 class ColumnTable:
     """Columns of a file by their position.
 
-    Attributes
-    ----------
-    names, units : of the columns; a unit is "" where the file states none.
-    rows : of a table of text.
-    vectors : of a file that holds numbers, one for each name.
-    notes : what was done to read it, in words.
+    ``names``, ``units``: of the columns; a unit is "" where the file states none. ``rows``: of a table of
+    text. ``vectors``: of a file that holds numbers, one for each name. ``notes``: what was done to read it,
+    in words.
     """
 
     names: Sequence[str]
@@ -86,11 +83,8 @@ def _check_names(names: Sequence[str], columns: Names) -> None:
     for key, name in columns.items():
         if name not in names:
             shown = ", ".join(repr(n[:40]) for n in [n for n in names if n][:8])
-            raise TraceError(
-                f"no column {name!r}; it has {shown}",
-                place="header",
-                remedy=f'rename the column, or name it in the study: [traces] {key} = "..."',
-            )
+            remedy = f'rename the column, or name it in the study: [traces] {key} = "..."'
+            raise TraceError(f"no column {name!r}; it has {shown}", place="header", remedy=remedy)
 
 
 # --- text
@@ -152,11 +146,9 @@ def _check_decimal_signs(rows: Sequence[Row], places: Sequence[int]) -> None:
     if None in found:
         return
     (_, point), (line, comma) = (one for one in found if one is not None)
-    raise TraceError(
-        f"{comma[:40]!r} has a comma, and {point[:40]!r} a point",
-        place=f"line {line}",
-        remedy="export numbers with one decimal sign, and without a sign between thousands",
-    )
+    what = f"{comma[:40]!r} has a comma, and {point[:40]!r} a point"
+    remedy = "export numbers with one decimal sign, and without a sign between thousands"
+    raise TraceError(what, place=f"line {line}", remedy=remedy)
 
 
 def _find_header(rows: Sequence[Row], columns: Names) -> Row:
@@ -235,11 +227,8 @@ def _add_times(
         return list(rows)
     starts, steps = (set(filter(None, tags.get(tag, []))) for tag in ("X0", "Delta_X"))
     if len(starts) != 1 or len(steps) != 1 or not all(map(is_number, starts | steps)):
-        raise TraceError(
-            "its channels are not sampled at the same times",
-            place="X0, Delta_X",
-            remedy="save them with one X column, or name a channel of times in the study: [traces] time_s",
-        )
+        remedy = "save them with one X column, or name a channel of times in the study: [traces] time_s"
+        raise TraceError("its channels are not sampled at the same times", place="X0, Delta_X", remedy=remedy)
     start, step = float(starts.pop()), float(steps.pop())
     return [(number, [repr(start + i * step), *row[1:]]) for i, (number, row) in enumerate(rows)]
 

@@ -134,11 +134,8 @@ def _remove_spikes(trace: Trace) -> tuple[Trace, list[TraceWarning]]:
         if not count:
             continue
         if count > max(_SPIKE_WIDTH, _MAX_SPIKES * len(values)):
-            raise TraceError(
-                f"{count} of {len(values)} samples stick out from their neighbours",
-                place=column,
-                remedy="check the sensor and its cable, and record again",
-            )
+            what = f"{count} of {len(values)} samples stick out from their neighbours"
+            raise TraceError(what, place=column, remedy="check the sensor and its cable, and record again")
         mended = values.copy()
         mended[spikes] = np.interp(trace.time_s[spikes], trace.time_s[~spikes], values[~spikes])
         largest = float(np.abs(values - mended).max())
@@ -232,11 +229,8 @@ def _remove_drift(
         return trace, []
     what = f"the force drifts by {slope:+.2g} N/s clear of the skin, {total:+.2g} N over the record"
     if abs(total) > _MAX_DRIFT * peak:
-        raise TraceError(
-            f"{what}, against a peak of {peak:.3g} N",
-            place="force_N",
-            remedy="let the sensor warm up, zero it, and record again",
-        )
+        what = f"{what}, against a peak of {peak:.3g} N"
+        raise TraceError(what, place="force_N", remedy="let the sensor warm up, zero it, and record again")
     numbers = {"drift_N_per_s": slope, "drift_sd_N_per_s": sd, "drift_N": total}
     shapes, misfits = _fit_drifts(time, force, trace.time_s)
     excess = (misfits - misfits.min()) / noise**2
@@ -304,11 +298,8 @@ def _check_start(trace: Trace, line: BrokenLine) -> None:
     if preload < _PRELOAD_SHARE * peak or not _is_rising_at_once(trace, line, noise):
         return
     zeroed = f", and {least:.3g} N when it is released" if released else ""
-    raise TraceError(
-        f"the record begins in contact: {first:.3g} N of {peak:.3g} N in its first samples{zeroed}",
-        place="force_N",
-        remedy="zero the sensor clear of the skin, and start there",
-    )
+    what = f"the record begins in contact: {first:.3g} N of {peak:.3g} N in its first samples{zeroed}"
+    raise TraceError(what, place="force_N", remedy="zero the sensor clear of the skin, and start there")
 
 
 def _is_rising_at_once(trace: Trace, line: BrokenLine, noise: float) -> bool:

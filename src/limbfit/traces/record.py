@@ -203,11 +203,9 @@ def read_columns(
 
     Raises `TraceError` with the file, the row or column, and the remedy.
 
-    Parameters
-    ----------
-    columns : the name of each column that must be there, by its key; a key ends in its unit, as ``time_s``.
-    select : True for the names of others that are read; these are their own keys.
-    gaps : an empty cell of a table is nan.
+    ``columns``: the name of each column that must be there, by its key; a key ends in its unit, as
+    ``time_s``. ``select``: True for the names of others that are read; these are their own keys. ``gaps``: an
+    empty cell of a table is nan.
     """
     table = read_table(file, columns)
     named = {name: key for key, name in columns.items()}
@@ -228,11 +226,8 @@ def _read_column(table: ColumnTable, key: str, name: str, empty: str, notes: lis
         found = [_read_numbers(table.rows, i, name, empty) for i in places]
     found = [values * find_factor(key, name, table.units[i], notes) for i, values in zip(places, found)]
     if any(not np.array_equal(values, found[0], equal_nan=True) for values in found):
-        raise TraceError(
-            f"{len(places)} columns are named {name!r}",
-            place="header",
-            remedy=f'rename the one that is meant, and name it in the study: [traces] {key} = "..."',
-        )
+        remedy = f'rename the one that is meant, and name it in the study: [traces] {key} = "..."'
+        raise TraceError(f"{len(places)} columns are named {name!r}", place="header", remedy=remedy)
     return found[0]
 
 
@@ -253,11 +248,9 @@ def find_factor(key: str, name: str, unit: str, notes: list[str]) -> float:
     factors = {folded.get(one.casefold(), 0.0) * (one != "MN") for one in units} or {1.0}
     factor = factors.pop()
     if not factor or factors:
-        raise TraceError(
-            f"the unit {' and '.join(units)!r} of column {name!r} is none of {', '.join(known)}",
-            place="units",
-            remedy=f'convert the column, or name another in the study: [traces] {key} = "..."',
-        )
+        what = f"the unit {' and '.join(units)!r} of column {name!r} is none of {', '.join(known)}"
+        remedy = f'convert the column, or name another in the study: [traces] {key} = "..."'
+        raise TraceError(what, place="units", remedy=remedy)
     if factor != 1.0:
         notes.append(f"column {name!r} is converted from {units[0]} to {next(iter(known))}")
     return factor

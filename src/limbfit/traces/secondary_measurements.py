@@ -115,15 +115,11 @@ def compute_thinnings(
     before = layers.time_s < touch_down_s
     inside = np.flatnonzero((layers.time_s >= touch_down_s) & (layers.time_s <= end_s))
     if not before.any():
-        raise TraceError(
-            "no reading before touch-down, so the thickness at rest is not known",
-            remedy="start the ultrasound before the indenter, on the same clock",
-        )
+        what = "no reading before touch-down, so the thickness at rest is not known"
+        raise TraceError(what, remedy="start the ultrasound before the indenter, on the same clock")
     if len(inside) < MIN_LAYER_READINGS:
-        raise TraceError(
-            f"only {len(inside)} readings in contact",
-            remedy=f"give at least {MIN_LAYER_READINGS}, at times of the record's own clock",
-        )
+        remedy = f"give at least {MIN_LAYER_READINGS}, at times of the record's own clock"
+        raise TraceError(f"only {len(inside)} readings in contact", remedy=remedy)
     parts = np.array_split(inside, min(len(inside), MAX_LAYER_POINTS))
     samples = np.array([float(len(part)) for part in parts])
     time = np.array([layers.time_s[part].mean() for part in parts]) - touch_down_s
@@ -162,11 +158,9 @@ class WaveSpeeds:
         before = np.flatnonzero(self.time_s < touch_down_s)
         inside = np.flatnonzero((self.time_s >= touch_down_s) & (self.time_s <= end_s))
         if len(before) + len(inside) < 2:
-            raise TraceError(
-                f"{len(before) + len(inside)} readings until the indenter lets go ({end_s:.2f} s)",
-                place=self.column,
-                remedy="give two or more, at times of the record's own clock",
-            )
+            what = f"{len(before) + len(inside)} readings until the indenter lets go ({end_s:.2f} s)"
+            remedy = "give two or more, at times of the record's own clock"
+            raise TraceError(what, place=self.column, remedy=remedy)
         both = (before, 2), (inside, MAX_WAVE_POINTS)
         parts = [part for of, most in both if len(of) for part in np.array_split(of, min(len(of), most))]
         time = np.maximum([self.time_s[part].mean() - touch_down_s for part in parts], 0.0)
@@ -352,8 +346,6 @@ def select_frames_in_contact(
     inside = (motion.time_s > touch_down_s) & (motion.time_s <= end_s)
     moved = motion.moved_mm[inside]
     if not np.isfinite(moved).any():
-        raise TraceError(
-            f"no displacement while the indenter presses ({touch_down_s:.2f} to {end_s:.2f} s)",
-            remedy="give some at times between, on the record's own clock",
-        )
+        what = f"no displacement while the indenter presses ({touch_down_s:.2f} to {end_s:.2f} s)"
+        raise TraceError(what, remedy="give some at times between, on the record's own clock")
     return SurfaceMotion(motion.points, motion.time_s[inside] - touch_down_s, moved)

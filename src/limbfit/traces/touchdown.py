@@ -144,11 +144,8 @@ def touch_down_at(trace: Trace, time_s: float) -> TouchDown:
     line = fit_broken_line(trace.time_s, trace.displacement_mm)
     first, last = float(trace.time_s[0]), line.peak_s
     if not first <= time_s < last:
-        raise TraceError(
-            f"{time_s:g} s is not on the way in",
-            place="touch_down_s",
-            remedy=f"give a time from {first:.3f} s to before {last:.3f} s",
-        )
+        remedy = f"give a time from {first:.3f} s to before {last:.3f} s"
+        raise TraceError(f"{time_s:g} s is not on the way in", place="touch_down_s", remedy=remedy)
     return replace(find_touch_down(trace, line), time_s=time_s, displacement_mm=float(line(np.array(time_s))))
 
 
@@ -226,9 +223,8 @@ def _weigh_onsets(part: OnsetPart, whiten: Array, places: Array, zeroed: bool) -
         weight -= np.log1p((baseline / (_ZERO_SHARE * part.rise_N)) ** 2)
     least, free = float(misfit.min()), max(len(force) - 5, 1)
     if not np.isfinite(least):
-        raise TraceError(
-            "the force does not rise where the skin is met", remedy="sample it faster, or check it"
-        )
+        what = "the force does not rise where the skin is met"
+        raise TraceError(what, remedy="sample it faster, or check it")
     weight -= 0.5 * misfit / max(1.0, least / free)
     share = np.exp(weight - weight.max())
     share /= share.sum()

@@ -92,33 +92,24 @@ class FaultClock:
 
     def find_active(self, kind: str) -> list[Fault]:
         """The faults of a kind that are on."""
-        return [fault for fault in self.faults if fault.kind == kind and self._is_on(fault)]
+        now, alike = self.now_us, (fault for fault in self.faults if fault.kind == kind)
+        return [one for one in alike if (start := self._start(one)) <= now < start + one.duration_s * 1e6]
 
     def compute_progress(self, fault: Fault) -> float:
         """How much of a fault's time has passed, 0 to 1."""
-        start = self._start(fault)
-        return 0.0 if start is None else min(max((self.now_us - start) / 1e6 / fault.duration_s, 0.0), 1.0)
+        return min(max((self.now_us - self._start(fault)) / 1e6 / fault.duration_s, 0.0), 1.0)
 
-    def _start(self, fault: Fault) -> float | None:
-        if fault.phase and fault.phase not in self._entered:
-            return None
-        return self._entered.get(fault.phase, 0) + fault.at_s * 1e6
-
-    def _is_on(self, fault: Fault) -> bool:
-        start = self._start(fault)
-        return start is not None and start <= self.now_us < start + fault.duration_s * 1e6
+    def _start(self, fault: Fault) -> float:
+        """Infinite while its phase has not been entered."""
+        return self._entered.get(fault.phase, np.inf if fault.phase else 0) + fault.at_s * 1e6
 
 
 class VirtualFitSocket:
     """One device with one limb in it.
 
-    Attributes
-    ----------
-    time_us : of the device.
-    stopped : the code of the stop that is latched, empty for none.
-    is_armed : a session runs, samples are sent, the watchdog watches.
-    host_has_left : the host has ended its session.
-    acknowledged_us : device time of the newest sample that limbfit has dealt with.
+    ``time_us``: of the device; ``stopped``: the code of the stop that is latched, empty for none;
+    ``is_armed``: a session runs, samples are sent, the watchdog watches; ``host_has_left``: the host has
+    ended its session; ``acknowledged_us``: device time of the newest sample that limbfit has dealt with.
     """
 
     def __init__(
@@ -291,12 +282,10 @@ class VirtualFitSocket:
         return ""
 
     def _acknowledge(self, number: int) -> None:
-        for sent, at in self._sent:
+        while self._sent and self._sent[0][0] <= number:
+            sent, at = self._sent.popleft()
             if sent == number:
                 self.acknowledged_us = max(self.acknowledged_us, at)
-                break
-        while self._sent and self._sent[0][0] <= number:
-            self._sent.popleft()
 
     def _end_session(self) -> None:
         if not self.is_home:

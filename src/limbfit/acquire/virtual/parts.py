@@ -18,6 +18,7 @@ from scipy.optimize import nnls
 
 from ...arrays import Array, Mask
 from ...errors import TraceError
+from ...traces.touchdown import compute_memory
 from ..line_protocol import PINS
 
 STEP_S = 0.001  # of time
@@ -63,7 +64,7 @@ def fit_surrogate(time_s: Array, displacement_mm: Array, force_N: Array) -> Surr
     fine = np.union1d(np.linspace(time_s[0], time_s[-1], _FINE_STEPS), time_s)
     at = np.searchsorted(fine, time_s)
     pieces = _split_depth(np.interp(fine, time_s, displacement_mm), depth)
-    columns = [pieces] + [_integrate_memory(fine, pieces, tau) for tau in TAUS_S]
+    columns = [pieces] + [compute_memory(fine, pieces.T, tau).T for tau in TAUS_S]
     matrix = np.concatenate([column[at] for column in columns], axis=1)
     touching = force_N > _CONTACT_FORCE_SHARE * peak
     rough = np.diff(np.eye(PIECES), axis=0)
@@ -82,16 +83,6 @@ def _split_depth(displacement: Array, depth: float) -> Array:
     """Return how much of each piece of the depth is passed, (n, PIECES); the last goes on."""
     gone = np.maximum(displacement, 0.0)[:, None] * (PIECES / depth) - np.arange(PIECES)
     return np.concatenate([np.clip(gone[:, :-1], 0.0, 1.0), np.maximum(gone[:, -1:], 0.0)], axis=1)
-
-
-def _integrate_memory(time: Array, levels: Array, tau: float) -> Array:
-    """Integrate exp(-(t - s)/tau) dlevel(s) exactly, with levels straight between times."""
-    memory = np.zeros_like(levels)
-    steps = np.diff(time)
-    for k, step in enumerate(steps):
-        decay = np.exp(-step / tau)
-        memory[k + 1] = decay * memory[k] + (levels[k + 1] - levels[k]) * (tau / step) * (1 - decay)
-    return memory
 
 
 class VirtualLimb:
@@ -161,11 +152,8 @@ class VirtualLimb:
 class Motors:
     """14 motors in steps of ``step_s``: trapezoids of speed towards targets.
 
-    Attributes
-    ----------
-    position_mm, speed_mm_s : (14,) of the motors, positive towards the limb.
-    head_mm : (14,) of the heads.
-    driving : (14,) whether a motor is under distance.
+    ``position_mm``, ``speed_mm_s``: (14,) of the motors, positive towards the limb; ``head_mm``: (14,) of the
+    heads; ``driving``: (14,) whether a motor is under distance.
     """
 
     def __init__(self, step_s: float) -> None:

@@ -74,9 +74,8 @@ class Endpoint:
                 raise InputError(f"{host} is no address of this machine", place="--host") from None
             reason = getattr(error, "strerror", None) or "no such port"
             remedy = "give another, or 0 for a free one"
-            raise InputError(
-                f"port {port} cannot be taken: {reason}", place="--port", remedy=remedy
-            ) from None
+            what = f"port {port} cannot be taken: {reason}"
+            raise InputError(what, place="--port", remedy=remedy) from None
         listener.setblocking(False)
         return cls(listener=listener)
 

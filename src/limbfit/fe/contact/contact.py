@@ -126,10 +126,8 @@ def check_clear(surface: ContactSurface, indenter: RigidShape, name: str) -> Non
     depth = -float(gaps[at])
     if depth > MAX_START_DEPTH_MM:
         where = ", ".join(f"{v:.2f}" for v in surface.points_at_rest[at])
-        raise ProblemError(
-            f"the {name} starts {depth:.3g} mm inside the tissue, deepest at ({where}) mm",
-            remedy="move it out along its axis, or start it touching",
-        )
+        what = f"the {name} starts {depth:.3g} mm inside the tissue, deepest at ({where}) mm"
+        raise ProblemError(what, remedy="move it out along its axis, or start it touching")
 
 
 @njit(cache=True)

@@ -43,11 +43,8 @@ Facets = tuple[Array, Array, Array, Array, Mask, Tree]
 class RigidShape(ABC):
     """A rigid shape with a frame of its own, in which it is asked for distances; mm.
 
-    Parameters
-    ----------
-    centre : (3,) the origin of the frame.
-    axis : (3,) its last axis, of any length; it points into the tissue.
-    edge : (3,) a direction in the plane of its first and last axis.
+    ``centre``: (3,) the origin of the frame. ``axis``: (3,) its last axis, of any length; it points into the
+    tissue. ``edge``: (3,) a direction in the plane of its first and last axis.
     """
 
     centre: Sequence[float] | Array
@@ -191,12 +188,9 @@ class Indenter(RigidShape):
 class Wall(RigidShape):
     """Triangles in a frame of their own.
 
-    Parameters
-    ----------
-    points : (n, 3) mm, in the body's frame.
-    faces : (m, 3) corners, counter-clockwise seen from the tissue.
-    centre : (3,) the origin of the body's frame, mm.
-    axis, edge : (3,) third and first axis of the frame; an advance moves along ``axis``.
+    ``points``: (n, 3) mm, in the body's frame. ``faces``: (m, 3) corners, counter-clockwise seen from the
+    tissue. ``centre``: (3,) the origin of the body's frame, mm. ``axis``, ``edge``: (3,) third and first axis
+    of the frame; an advance moves along ``axis``.
     """
 
     points: Array
@@ -235,10 +229,8 @@ def check_open_surface(points: Array, faces: NDArray, name: str) -> tuple[Array,
     check_triangles(points, faces, name)
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     if len(np.unique(edges, axis=0)) < len(edges):
-        raise ProblemError(
-            f"the triangles of {name} do not agree on a side, or more than two meet at an edge",
-            remedy="orient them alike, counter-clockwise seen from the tissue",
-        )
+        what = f"the triangles of {name} do not agree on a side, or more than two meet at an edge"
+        raise ProblemError(what, remedy="orient them alike, counter-clockwise seen from the tissue")
     return points, faces.astype(np.int64)
 
 

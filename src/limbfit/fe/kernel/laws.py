@@ -146,11 +146,9 @@ class EvaluationPoints:
 def evaluate_elastic_at(points: EvaluationPoints, laws: Laws, u: Array) -> tuple[Array, Array, Array]:
     """What the elastic laws give at displacements ``u (n, 3)``, mm.
 
-    Returns
-    -------
-    stress : (m, 6) deviatoric second Piola-Kirchhoff stress Se, MPa.
-    moduli : (m, 6, 6) its derivative by the strain E; tensor components in both, MPa.
-    gradient : (m, 3, 3) the deformation gradient.
+    Returns ``stress``: (m, 6) deviatoric second Piola-Kirchhoff stress Se, MPa. ``moduli``: (m, 6, 6) its
+    derivative by the strain E; tensor components in both, MPa. ``gradient``: (m, 3, 3) the deformation
+    gradient.
     """
     m = len(points.cells)
     stress, D, F = np.empty((m, 6)), np.empty((m, 6, 6)), np.empty((m, 3, 3))

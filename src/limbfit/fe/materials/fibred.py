@@ -66,11 +66,9 @@ class _Extension(Material):
 class FibredMaterial(_Extension):
     """A `Material` with fibres; their direction is the problem's (`Problem.fibres`).
 
-    Parameters
-    ----------
-    ground : the isotropic law; its relaxation holds for the fibres too.
-    k1 : stiffness of the fibres, MPa: their uniaxial modulus at small stretch is ``4 k1``; 0: none.
-    k2 : how fast they stiffen, dimensionless.
+    ``ground``: the isotropic law; its relaxation holds for the fibres too. ``k1``: stiffness of the fibres,
+    MPa: their uniaxial modulus at small stretch is ``4 k1``; 0: none. ``k2``: how fast they stiffen,
+    dimensionless.
     """
 
     ground: Uncoupled
@@ -95,10 +93,8 @@ class FibredMaterial(_Extension):
 class ContractileMaterial(_Extension):
     """A `Material` with fibres that contract; when and how much of it is the problem's `Problem.activation`.
 
-    Parameters
-    ----------
-    passive : the tissue at rest; its fibres' ``k1`` may be 0.
-    active : true stress along the fibres of full activation, MPa, not negative.
+    ``passive``: the tissue at rest; its fibres' ``k1`` may be 0. ``active``: true stress along the fibres of
+    full activation, MPa, not negative.
     """
 
     passive: FibredMaterial

@@ -52,10 +52,8 @@ class OgdenSum(Uncoupled):
             check_not_negative(f"g{l}", g)
             check_positive(f"tau{l}", tau)
         if not self.shear_modulus > 0:
-            raise ProblemError(
-                f"the shear modulus of small strains is {self.shear_modulus:.4g} MPa, not positive",
-                remedy="check the signs of the moduli",
-            )
+            what = f"the shear modulus of small strains is {self.shear_modulus:.4g} MPa, not positive"
+            raise ProblemError(what, remedy="check the signs of the moduli")
 
     @property
     def parameter_names(self) -> tuple[str, ...]:
@@ -133,9 +131,8 @@ class OgdenQLV(SymmetricOgden):
         for name in ("gamma", "tau"):
             object.__setattr__(self, name, _to_one_or_several(name, getattr(self, name)))
         if np.shape(self.gamma) != np.shape(self.tau):
-            raise ProblemError(
-                f"{np.size(self.gamma)} gamma and {np.size(self.tau)} tau", remedy="give as many of each"
-            )
+            what = f"{np.size(self.gamma)} gamma and {np.size(self.tau)} tau"
+            raise ProblemError(what, remedy="give as many of each")
         for name in ("c", "m", "kappa_ratio"):
             check_positive(name, getattr(self, name))
         for name, value in zip(self.parameter_names[2:], self.parameters[2:], strict=True):

@@ -58,10 +58,8 @@ class LawTable:
         Ogden terms.
         """
         if not self.has_terms:
-            raise ProblemError(
-                "the tissue's law is not a sum of Ogden terms, and other programs know no other",
-                remedy="use one of Ogden terms there",
-            )
+            what = "the tissue's law is not a sum of Ogden terms, and other programs know no other"
+            raise ProblemError(what, remedy="use one of Ogden terms there")
         return self.numbers.reshape(-1, 2)
 
 

@@ -83,9 +83,8 @@ def schedule_steps(history: History, control: StepControl, turns: Sequence[float
             grade_steps(history, control.load_steps, control.unload_steps), np.asarray(turns, dtype=float)
         )
     if control.times[-1] > history.times[-1] * (1.0 + 1e-9):
-        raise ProblemError(
-            f"a step at {control.times[-1]} s lies beyond the history's end at {history.times[-1]} s"
-        )
+        what = f"a step at {control.times[-1]} s lies beyond the history's end at {history.times[-1]} s"
+        raise ProblemError(what)
     return np.asarray(control.times, dtype=float)
 
 

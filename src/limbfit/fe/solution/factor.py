@@ -234,12 +234,9 @@ class Factor:
     ) -> LinearSolution:  # fmt: skip
         """Solve ``A x = b (n, r)`` by conjugate gradients from the guess ``x``.
 
-        Parameters
-        ----------
-        data : entries of A.
-        springs : the contact springs in which A differs from the factor.
-        tolerance : of the residual of each column, relative to ``b``.
-        limit : of products; by default what a factorisation would have cost.
+        ``data``: entries of A. ``springs``: the contact springs in which A differs from the factor.
+        ``tolerance``: of the residual of each column, relative to ``b``. ``limit``: of products; by default
+        what a factorisation would have cost.
         """
         target = tolerance * np.linalg.norm(b, axis=0)
         x = np.zeros_like(b) if x is None else x.copy()
@@ -370,7 +367,7 @@ class SpringColumns:
     def __init__(self, system: System, factor: Factor) -> None:
         self._bodies, self._unknowns, self._factor = system.bodies, system.unknowns, factor
         self.inner = system.bodies.find_points_on(factor.solver.last)
-        self._shares = system.bodies.select_shares(factor.solver.last)
+        self._shares = system.bodies.shares[factor.solver.last]
         self.clear(None)
 
     def clear(self, blocks: Array | None) -> None:

@@ -38,12 +38,9 @@ TOLERANCE = 1e-3
 class ExplicitDerivative:
     """What the parameters change in a step at fixed displacement.
 
-    Parameters
-    ----------
-    forces : (n, 3, p) derivative of the internal forces, N; no contact in it.
-    elastic : (m, q, 6, p) derivative of the elastic stress Se.
-    stress : (m, q, 6) Se itself, MPa.
-    moduli : (m, q, 6, 9) derivative of Se with respect to the deformation gradient, column by column, MPa.
+    ``forces``: (n, 3, p) derivative of the internal forces, N; no contact in it. ``elastic``: (m, q, 6, p)
+    derivative of the elastic stress Se. ``stress``: (m, q, 6) Se itself, MPa. ``moduli``: (m, q, 6, 9)
+    derivative of Se with respect to the deformation gradient, column by column, MPa.
     """
 
     forces: Array

@@ -328,15 +328,9 @@ class SteppedRun:
         if self.problem.history.forced:
             displacement = float(coordinates[0, 2])
             deepening = None if du is None else du[self.system.nodes, 2]
+        memory = after.drop_past()
         state = self._build_state(
-            increment.time,
-            displacement,
-            u,
-            stiffness,
-            du,
-            after.drop_past(),
-            increment.drives,
-            increment.grips,
+            increment.time, displacement, u, stiffness, du, memory, increment.drives, increment.grips
         )
         self.states = [*self.states[-2:], state]
         if found.residual > self.control.tolerance:

@@ -87,11 +87,8 @@ CLEARANCE_WIDTHS = 3.0  # widths of the indenter that it is off the tissue until
 class IndenterStart:
     """How far the indenter begins beyond where it would touch the tissue at rest.
 
-    Parameters
-    ----------
-    waits : True if it is still clear of the tissue.
-    offset : mm along its axis.
-    slope : (p,) derivative of the offset with respect to the parameters; None where it has none.
+    ``waits``: True if it is still clear of the tissue. ``offset``: mm along its axis. ``slope``: (p,)
+    derivative of the offset with respect to the parameters; None where it has none.
     """
 
     waits: bool = False

@@ -178,10 +178,8 @@ def solve_until_onset(problem: Problem, steps: StepControl = StepControl()) -> F
         if not run.touch.waits:
             times = np.array([0.0, first.time])
             return FirstStep(run.touch.offset, times, np.array([start, first.coordinates]))
-    raise ProblemError(
-        f"the tissue that moves before the indenter touches it found no equilibrium: {run.reason}",
-        remedy="take smaller steps (solver.load_steps), or less force",
-    )
+    what = f"the tissue that moves before the indenter touches it found no equilibrium: {run.reason}"
+    raise ProblemError(what, remedy="take smaller steps (solver.load_steps), or less force")
 
 
 def _collect_columns(rows: Sequence[Step]) -> dict[str, Any]:

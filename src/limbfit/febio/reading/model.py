@@ -253,16 +253,14 @@ def _compute_settling_time_s(model: FebModel, other_curves: Mapping[int, str]) -
     for number, description in other_curves.items():
         values = curves[number].at(times)
         if np.abs(values - values[0]).max() > 0.0:
-            raise _build_prestrain_error(
-                f"settles while {description} changes", growing[0], "let it change after the first step"
-            )
+            what = f"settles while {description} changes"
+            raise _build_prestrain_error(what, growing[0], "let it change after the first step")
     for held in conditions:
         gone = held.curve and held.step == 0 and held.kind == "moved"
         later = {(c.body, c.freedom) for c in conditions if c.kind == "moved" and c.step in (None, 1)}
         if gone and held.factor * curves[held.curve].at(first) and (held.body, held.freedom) not in later:
-            raise _build_prestrain_error(
-                f"settles while the rigid body {held.body!r} goes elsewhere", growing[0]
-            )
+            what = f"settles while the rigid body {held.body!r} goes elsewhere"
+            raise _build_prestrain_error(what, growing[0])
     return first
 
 

@@ -68,10 +68,8 @@ def find_carried_nodes(
 
     Raises `ProblemError` for a node that two bodies would carry.
 
-    Parameters
-    ----------
-    soft, bodies : names of the deformable and of the rigid materials.
-    conditions : rigid body and ``<bc type="rigid">`` of every set that is tied.
+    ``soft``, ``bodies``: names of the deformable and of the rigid materials; ``conditions``: rigid body and
+    ``<bc type="rigid">`` of every set that is tied.
     """
     tissue = collect_nodes(geometry.select_parts(soft).values())
     found = {}
@@ -264,11 +262,9 @@ def build_motion(
         forced = np.concatenate([forced, np.broadcast_to(under, (between, 6))])
     if not has_same_rotation(values, forced):
         lines = [c.line for c in own if c.freedom > 2 and c.kind != "fixed"]
-        raise ProblemError(
-            f"the rigid body {name!r} turns about more than one axis",
-            place=f"line {lines[0]}" if lines else "<Rigid>",
-            remedy="hold two of Ru, Rv, Rw, or leave all three free",
-        )
+        what = f"the rigid body {name!r} turns about more than one axis"
+        place = f"line {lines[0]}" if lines else "<Rigid>"
+        raise ProblemError(what, place=place, remedy="hold two of Ru, Rv, Rw, or leave all three free")
     return Motion(times, values, forced)
 
 

@@ -132,9 +132,8 @@ def read_curves(section: XmlNode | None) -> dict[int, LoadCurve]:
             raise node.error(f"load controller {number} is there twice")
         kind = node.attribute("type")
         if kind == "math":
-            curves[number] = LoadCurve(
-                np.zeros((0, 2)), "MATH", node.line, formula=_read_formula(node.child("math"))
-            )
+            formula = _read_formula(node.child("math"))
+            curves[number] = LoadCurve(np.zeros((0, 2)), "MATH", node.line, formula=formula)
         elif kind == "loadcurve":
             curves[number] = _read_curve(node)
         else:

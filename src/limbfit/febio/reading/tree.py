@@ -88,7 +88,7 @@ class XmlNode(list["XmlNode"]):
         try:
             values = [float(part) for part in self.text.split(",")]
         except ValueError:
-            raise self.error(f"{_shorten(self.text)} is not {count} numbers") from None
+            values = []
         if len(values) != count:
             raise self.error(f"{_shorten(self.text)} is not {count} numbers")
         if not all(map(math.isfinite, values)):
@@ -152,11 +152,8 @@ class _TreeBuilder:
         self.parser.StartDoctypeDeclHandler = self._doctype
 
     def _doctype(self, *_: Any) -> None:
-        raise ProblemError(
-            "has a document type, which may hold entities; none is read",
-            place=f"line {self.parser.CurrentLineNumber}",
-            remedy="remove <!DOCTYPE>",
-        )
+        what = "has a document type, which may hold entities; none is read"
+        raise ProblemError(what, place=f"line {self.parser.CurrentLineNumber}", remedy="remove <!DOCTYPE>")
 
     def _start(self, tag: str, attributes: dict[str, str]) -> None:
         node = XmlNode(tag, attributes, self.parser.CurrentLineNumber)

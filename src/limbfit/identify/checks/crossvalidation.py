@@ -120,11 +120,8 @@ def fit_sites(
 ) -> Fold:
     """Fit the ``chosen`` sites, and predict all of them.
 
-    Parameters
-    ----------
-    simulate : returns all sites of ``measured``, in order.
-    unknowns : start at the study's own answer.
-    grouping : parameters that move together, as in the study's last stage; by default each by itself.
+    ``simulate``: returns all sites of ``measured``, in order. ``unknowns``: start at the study's own answer.
+    ``grouping``: parameters that move together, as in the study's last stage; by default each by itself.
     """
 
     def simulate_chosen(parameters: Array) -> list[SiteResponse]:

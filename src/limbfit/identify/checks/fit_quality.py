@@ -117,12 +117,7 @@ def _test_autocorrelation(white: Array) -> float:
 
 
 def _assess_phases(
-    times_s: Array,
-    depth_mm: Array,
-    residual_N: Array,
-    refitted_N: Array,
-    peak_N: float,
-    covariance: Array,
+    times_s: Array, depth_mm: Array, residual_N: Array, refitted_N: Array, peak_N: float, covariance: Array
 ) -> tuple[PhaseFit, ...]:
     kinds = np.full(len(times_s), "", dtype=object)
     for phase in find_phases(times_s, depth_mm):

@@ -72,11 +72,9 @@ class LeaveOutFits:
 
     A record is left out with all others of its site, because these tell the same.
 
-    Parameters
-    ----------
-    simulate : returns all sites of ``measured``, in order; cheap.
-    start : the answer (p,), from which the fits start, and which they keep where the data say nothing.
-    tie : (p, k) as `SearchSpace`, which parameters move, and which of them together; None: each by itself.
+    ``simulate``: returns all sites of ``measured``, in order; cheap. ``start``: the answer (p,), from which
+    the fits start, and which they keep where the data say nothing. ``tie``: (p, k) as `SearchSpace`, which
+    parameters move, and which of them together; None: each by itself.
     """
 
     def __init__(
@@ -356,12 +354,9 @@ def find_outliers(
     at bounds to fit that record. Then the sites are judged from ``neutral``, the answer with one material,
     which cannot follow a wrong record as far.
 
-    Parameters
-    ----------
-    simulate : returns all sites; called at ``start``, and at ``neutral`` if that is needed.
-    histories : times (n,) s and depths (n,) mm of each record.
-    simulate_exchange : simulates two sites with parameters (p,), each with the other's record.
-    tie : as `LeaveOutFits`.
+    ``simulate``: returns all sites; called at ``start``, and at ``neutral`` if that is needed. ``histories``:
+    times (n,) s and depths (n,) mm of each record. ``simulate_exchange``: simulates two sites with parameters
+    (p,), each with the other's record. ``tie``: as `LeaveOutFits`.
     """
     if count_sites(measured) < MIN_SITES:
         return (), ()

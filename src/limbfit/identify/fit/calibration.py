@@ -406,11 +406,8 @@ class _Search:
             old, new = (
                 compute_residuals("paper", self.responses_at(p), self.measured)[0] for p in (first, second)
             )
-            return (
-                "no entry of the objective changed by more than 0.01"
-                if np.abs(new - old).max() < _PAPER_CHANGE
-                else ""
-            )
+            stays = np.abs(new - old).max() < _PAPER_CHANGE
+            return "no entry of the objective changed by more than 0.01" if stays else ""
 
         return stop
 

@@ -181,12 +181,9 @@ def calibrate_with_correction(
     the interrupted one. If a fine simulation fails, the correction before it is kept, and the stage has not
     converged.
 
-    Parameters
-    ----------
-    coarse : returns force and derivatives per site; cheap.
-    fine : returns forces per site without derivatives; expensive. It is called once per round, and again if
-        it fails.
-    fidelity : when corrections end.
+    ``coarse``: returns force and derivatives per site; cheap. ``fine``: returns forces per site without
+    derivatives; expensive. It is called once per round, and again if it fails. ``fidelity``: when corrections
+    end.
     """
     run = _CorrectionLoop(
         coarse,

@@ -82,13 +82,10 @@ def sample_uncertainty(
 
     If not even two evaluations completed, ``linearised`` itself is returned; its ``method`` says so.
 
-    Parameters
-    ----------
-    linearised : of ``estimate_uncertainty``. Its covariance of the residuals is used, and that of the answer,
-        or of the most probable parameters.
-    evaluations : of the calibration.
-    simulate : called for at most ``further`` more evaluations; one that fails is tried again half-way.
-    move_answer : True if the answer moves from the least squares to the most probable parameters.
+    ``linearised``: of ``estimate_uncertainty``. Its covariance of the residuals is used, and that of the
+    answer, or of the most probable parameters. ``evaluations``: of the calibration. ``simulate``: called for
+    at most ``further`` more evaluations; one that fails is tried again half-way. ``move_answer``: True if the
+    answer moves from the least squares to the most probable parameters.
     """
     runs = evaluations.select_near(linearised.measured)
     if len(runs.points) < 2:

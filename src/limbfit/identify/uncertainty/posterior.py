@@ -265,12 +265,10 @@ def explore_posterior(
 ) -> Exploration:
     """Explore the parameters around a calibration's answer.
 
-    Parameters
-    ----------
-    simulate : takes several full parameters (p,) and returns the responses of each; failed ones are left out.
-    linearised : the linearised uncertainty there, whose covariance of the residuals is used.
-    points : parameters that were simulated before, which ``simulate`` returns at no cost.
-    report : called with sentences on the progress.
+    ``simulate``: takes several full parameters (p,) and returns the responses of each; failed ones are left
+    out. ``linearised``: the linearised uncertainty there, whose covariance of the residuals is used.
+    ``points``: parameters that were simulated before, which ``simulate`` returns at no cost. ``report``:
+    called with sentences on the progress.
     """
     settings, space, model = settings or ExplorationSettings(), linearised.space, linearised.residual_model
     # Recorded noise, or where the model is wrong by more than that, a third of by how much.

@@ -85,15 +85,10 @@ class PriorPrecision:
         """Return how much of what is known of each parameter comes from the stated priors.
 
         ``covariance``: (k, k) of the most probable answer to records, bounds and priors together. ``tie``:
-        (p, k) of the space.
-
-        Returns
-        -------
-        share : (p,) the part of the variance that comes from the deviations of the priors' medians; the rest
-            comes from records and bounds.
-        wider : (p,) how many times as wide the interval of the logarithm would be without priors.
-
-        Both follow from linear theory; they are 0 and 1 for a parameter that does not move.
+        (p, k) of the space. Returned are (p,) the part of the variance that comes from the deviations of the
+        priors' medians, where the rest comes from records and bounds, and (p,) how many times as wide the
+        interval of the logarithm would be without priors. Both follow from linear theory; they are 0 and 1
+        for a parameter that does not move.
         """
         given = self.rows.T @ self.rows
         alone = np.linalg.inv(np.linalg.inv(covariance) - given)

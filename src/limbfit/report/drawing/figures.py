@@ -131,7 +131,17 @@ def draw_convergence_figure(store: Results) -> Figure | None:
     for stage in stages:
         _draw_stage(axes, store, stage, offset)
         offset += len(stage.iterations)
-    _finish_convergence(axes, store)
+    axes[0].set_title("Error (%)")
+    axes[0].set_yscale("log")
+    plots.format_log_axis(axes[0].yaxis, minor=True)
+    for ax, name in zip(axes[1:], store.law.keys, strict=True):
+        ax.set_title(f"{format_symbol(name)} ({format_unit(name)})")
+        for i, (tissue, values) in enumerate(store.truth.get("parameters", {}).items()):
+            if name in values:
+                ax.axhline(values[name], lw=1, label=f"truth, {tissue}", **plots.choose_truth_style(i))
+    for ax in axes:
+        ax.set_xlabel("Iterate")
+        ax.xaxis.set_major_locator(MaxNLocator(5, integer=True))
     count = sum(len(ax.get_legend_handles_labels()[0]) for ax in axes[:2])
     plots.add_legend(drawing, *axes[:2], columns=math.ceil(count / math.ceil(count / MAX_LEGEND_ROW)))
     error = stages[-1].iterations[-1].error_percent
@@ -153,20 +163,6 @@ def _draw_stage(axes: Sequence[Axes], store: Results, stage: SearchStage, offset
     if offset:
         for ax in axes:
             ax.axvline(offset - 0.5, color=MUTED, lw=0.8)
-
-
-def _finish_convergence(axes: Sequence[Axes], store: Results) -> None:
-    axes[0].set_title("Error (%)")
-    axes[0].set_yscale("log")
-    plots.format_log_axis(axes[0].yaxis, minor=True)
-    for ax, name in zip(axes[1:], store.law.keys, strict=True):
-        ax.set_title(f"{format_symbol(name)} ({format_unit(name)})")
-        for i, (tissue, values) in enumerate(store.truth.get("parameters", {}).items()):
-            if name in values:
-                ax.axhline(values[name], lw=1, label=f"truth, {tissue}", **plots.choose_truth_style(i))
-    for ax in axes:
-        ax.set_xlabel("Iterate")
-        ax.xaxis.set_major_locator(MaxNLocator(5, integer=True))
 
 
 @plots.styled

@@ -43,21 +43,13 @@ def draw_surfaces_sheet(store: Results) -> Drawing:
     rows = [pictures.PictureRow(pictures.render_views(plotter, views), pictures.SIDES)]
     for thickness, title in _measure_thicknesses(store, skin):
         limits = (0.0, float(min(np.ceil(np.percentile(thickness, 99)), THICKEST_MM)))
-        shots = pictures.render_views(
-            pictures.make_field_plotter(skin.copy(), thickness, limits, **pictures.MATT), views
-        )
+        plotter = pictures.make_field_plotter(skin.copy(), thickness, limits, **pictures.MATT)
+        shots = pictures.render_views(plotter, views)
         rows.append(pictures.PictureRow(shots, ("",) * 4, (limits, title)))
     regions = [name for name in store.surface_files if name.startswith("region-")]
-    keys = [
-        pictures.make_key("skin", pictures.SKIN_SURFACE),
-        pictures.make_key("bone", pictures.BONE),
-        pictures.make_key("proximal cut", CUT_PLANE),
-    ]
-    keys += [
-        pictures.make_key(name.removeprefix("region-"), pictures.choose_inner_colour(name))
-        for name in regions
-    ]
-    return pictures.build_figure_sheet("Surfaces", rows, keys)
+    named = [("skin", pictures.SKIN_SURFACE), ("bone", pictures.BONE), ("proximal cut", CUT_PLANE)]
+    named += [(name.removeprefix("region-"), pictures.choose_inner_colour(name)) for name in regions]
+    return pictures.build_figure_sheet("Surfaces", rows, [pictures.make_key(*one) for one in named])
 
 
 def draw_sites_sheet(store: Results) -> Drawing:
@@ -83,13 +75,10 @@ def draw_sites_sheet(store: Results) -> Drawing:
     keys = [pictures.make_key(name or "no region", colour, dot=True) for name, colour in colours.items()]
     used = {row.fitted for row in store.sites}
     if len(used) == 2:
-        keys += [
-            pictures.make_key("fitted", "#555555", True),
-            pictures.make_key("held out", "#555555", True, filled=False),
-        ]
-    return pictures.build_figure_sheet(
-        "Sites, with the axis of the indenter", [pictures.PictureRow(shots, pictures.SIDES)], keys
-    )
+        uses = (("fitted", True), ("held out", False))
+        keys += [pictures.make_key(use, "#555555", dot=True, filled=filled) for use, filled in uses]
+    rows = [pictures.PictureRow(shots, pictures.SIDES)]
+    return pictures.build_figure_sheet("Sites, with the axis of the indenter", rows, keys)
 
 
 def draw_mesh_sheet(store: Results) -> Drawing:
@@ -102,10 +91,8 @@ def draw_mesh_sheet(store: Results) -> Drawing:
         colours |= pictures.choose_region_colours(grid)
         tets = grid.cell_connectivity.reshape(-1, 4)
         angles[row.site] = compute_dihedral_angles(np.asarray(grid.points, float), tets).min(axis=1)
-    keys = [
-        pictures.make_key(name, colour)
-        for name, colour in (colours | {"wall of a bone": pictures.BONE}).items()
-    ]
+    colours["wall of a bone"] = pictures.BONE
+    keys = [pictures.make_key(name, colour) for name, colour in colours.items()]
     title = "Meshes, cut along the limb through the site"
     drawing = pictures.build_figure_sheet(title, pictures.make_mesh_rows(found), keys, spare_in=2.2)
     _draw_histogram(drawing, angles)
