@@ -228,13 +228,7 @@ def fit_socket(
         what = f"there is nothing to draw {samples} samples from: the parameters were not identified"
         raise InputError(what, place="--samples", remedy="identify them (limbfit run)")
     return run_experiment(
-        study,
-        "socket",
-        listener=listener,
-        parameters=used,
-        parameters_from=origin,
-        samples=samples,
-        **known,
+        study, "socket", listener=listener, parameters=used, parameters_from=origin, samples=samples, **known
     )
 
 
