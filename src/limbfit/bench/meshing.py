@@ -45,6 +45,8 @@ def bench_meshing(
 ) -> dict[str, Any]:
     """Mesh random sites of each limb and sum up.
 
+    Returns ``sites``, ``failures``, ``min_dihedral_deg``, ``seconds_median`` (CPU seconds of a site's mesh,
+    its mesher included) and more over all limbs; ``limbs`` has a summary of each, ``failed`` the messages.
     Raises `InputError` where the real limbs are missing, or for an engine that is not in the table.
 
     Parameters
@@ -54,12 +56,6 @@ def bench_meshing(
     engine : name of the mesher.
     settings : of the meshes; the defaults where not given.
     makers : other limbs than the five, by name.
-
-    Returns
-    -------
-    dict
-        ``sites``, ``failures``, ``min_dihedral_deg``, ``seconds_median`` (CPU seconds of a site's mesh, its
-        mesher included) and more over all limbs; ``limbs`` has a summary of each, ``failed`` the messages.
     """
     if engine not in ENGINES:
         raise InputError(f"no mesher is named {engine!r}", remedy=f"use one of {', '.join(ENGINES)}")

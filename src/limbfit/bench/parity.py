@@ -237,8 +237,7 @@ def _build_comparison_row(part: CasePart, log: FebioLog, febio: FebioLog, reason
     times = febio.times[:count]
     inside = np.any([(times > a * (1 + 1e-9)) & (times <= b * (1 + 1e-9)) for a, b in part.spans], axis=0)
     if reason or not np.allclose(log.times[:count], times, rtol=1e-6):
-        reason = reason or "other steps than FEBio's"
-        return _build_unfinished_row(reason)
+        return _build_unfinished_row(reason or "other steps than FEBio's")
     mine = log.values[:count][inside][..., [log.names.index(name) for name in part.columns]]
     theirs_inside = theirs[:count][inside]
     unit = "force_N" if forces else "displacement_mm"

@@ -215,17 +215,10 @@ def rig(
 ) -> None:
     """Check the force of a rig of your own with a known weight, as a session needs every day."""
     print_line("leave the force sensor unloaded")
-    found = limbfit.check_rig(file, weight_kg, lambda: _wait_for_weight(weight_kg))
+    ask = f"hang {weight_kg:g} kg on it, wait until it hangs still, and press Enter"
+    found = limbfit.check_rig(file, weight_kg, lambda: prompt(ask, default="", show_default=False))
     print_line(
         f"the weight shows {found['ratio']:.3f} times its force; next: limbfit acquire --device rig:{file}"
-    )
-
-
-def _wait_for_weight(weight_kg: float) -> None:
-    prompt(
-        f"hang {weight_kg:g} kg on it, wait until it hangs still, and press Enter",
-        default="",
-        show_default=False,
     )
 
 

@@ -102,7 +102,7 @@ def uncertainty(
         Option(
             help="instead, calibrate other models on the same records and weigh them: all, or some of "
             "two-terms, power, fung, fibres, thinner, thicker, friction, separated by commas; each takes as "
-            "long as limbfit run",
+            "long as limbfit run"
         ),
     ] = None,
     as_json: AsJson = False,
@@ -160,24 +160,17 @@ def sensitivity(
     as_json: AsJson = False,
 ) -> None:
     """Simulate again with another c, bulk modulus, friction, indenter or mesh."""
-    results = {}
-    for name in parse_sensitivities(only):
+    results, names = {}, list(SENSITIVITIES) if only is None else [name.strip() for name in only.split(",")]
+    if wrong := [name for name in names if name not in SENSITIVITIES]:
+        remedy = f"use {', '.join(SENSITIVITIES)}"
+        raise InputError(f"{wrong[0]!r} cannot be changed", place="--only", remedy=remedy)
+    for name in names:
         result = call_on_study(study, limbfit.run_experiment, f"sensitivity-{name}", sites=site or [])
         results[name] = result
         if not as_json:
             console.print_stored(result, f"sensitivity_{name}", partial(show_sensitivity, name), False)
     if as_json:
         console.print_json(results)
-
-
-def parse_sensitivities(only: str | None) -> list[str]:
-    """``--only``: names of what is changed."""
-    names = list(SENSITIVITIES) if only is None else [name.strip() for name in only.split(",")]
-    wrong = [name for name in names if name not in SENSITIVITIES]
-    if wrong:
-        remedy = f"use {', '.join(SENSITIVITIES)}"
-        raise InputError(f"{wrong[0]!r} cannot be changed", place="--only", remedy=remedy)
-    return names
 
 
 def show_sensitivity(name: str, found: Any) -> None:

@@ -15,9 +15,8 @@ def init(folder: Annotated[Path, Argument(help="folder with images or surfaces, 
     """Make a study.toml by asking, for the images or surfaces, and the records in a folder."""
     found = limbfit.list_inputs(folder)
     images = [row for row in found["images"] if row.get("whole", True)]
-    content: dict[str, Any] = {
-        "name": prompt("name of the study (no patient's name)", default=folder.resolve().name)
-    }
+    name = prompt("name of the study (no patient's name)", default=folder.resolve().name)
+    content: dict[str, Any] = {"name": name}
     image = _choose("image of the limb", images, "none: the limb is given by surfaces")
     if image is None:
         content |= _ask_surfaces(found["surfaces"])
@@ -39,9 +38,7 @@ def init(folder: Annotated[Path, Argument(help="folder with images or surfaces, 
         print_line(f"it has no site yet: limbfit run {folder} --until surfaces, then limbfit studio {folder}")
 
 
-def _choose(
-    what: str, rows: Sequence[dict[str, Any]], otherwise: str, default: int = 1
-) -> dict[str, Any] | None:
+def _choose(what: str, rows: Sequence[Any], otherwise: str, default: int = 1) -> dict[str, Any] | None:
     """One of some files, by its number; 0: ``otherwise``."""
     if not rows:
         return None
@@ -55,17 +52,11 @@ def _choose(
 
 def _ask_surfaces(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
     skin = _choose("surface of the skin", rows, "none")
-    bones = {}
-    for row in rows:
-        if row is not skin and (
-            name := prompt(f"name of the bone in {row['path']} (empty: no bone)", default="")
-        ):
-            bones[name] = row["path"]
-    return {
-        "skin": skin and skin["path"],
-        "bones": bones,
-        "unit": prompt("unit of the surfaces", default="mm"),
-    }
+    ask = "name of the bone in {} (empty: no bone)"
+    named = {prompt(ask.format(row["path"]), default=""): row["path"] for row in rows if row is not skin}
+    bones = {name: path for name, path in named.items() if name}
+    unit = prompt("unit of the surfaces", default="mm")
+    return {"skin": skin and skin["path"], "bones": bones, "unit": unit}
 
 
 def _ask_site(trace: str, marked: bool) -> dict[str, Any]:

@@ -17,8 +17,7 @@ from .console import AsJson, Column
 
 _OPTIONS = {
     "workers": Annotated[
-        int | None,
-        Option(help="jobs side by side; 0: one per core; default: the study's", min=0, max=1024),
+        int | None, Option(help="jobs side by side; 0: one per core; default: the study's", min=0, max=1024)
     ],
     "scheduler": Annotated[str | None, Option(help="a Dask scheduler, such as tcp://host:8786")],
     "dask": Annotated[str | None, Option(help=f"start Dask workers: {', '.join(QUEUES)}, or local")],
@@ -35,11 +34,10 @@ def add_execution_options(verb: Callable[..., None]) -> Callable[..., None]:
             verb(**arguments)
 
     parameters = list(inspect.signature(verb, eval_str=True).parameters.values())
-    added = [
+    parameters += [
         inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=kind)
         for name, kind in _OPTIONS.items()
     ]
-    parameters += added
     run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
     run.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
     return run
@@ -97,8 +95,7 @@ def reproduce(
 
 
 def doctor(
-    folder: Annotated[Path, Argument(help="where studies would lie")] = Path("."),
-    as_json: AsJson = False,
+    folder: Annotated[Path, Argument(help="where studies would lie")] = Path("."), as_json: AsJson = False
 ) -> None:
     """Check this machine: versions, cores, memory, solvers, meshers, write access, and a small problem."""
     result = limbfit.diagnose(folder)

@@ -1,5 +1,6 @@
 """``limbfit shapes``: shapes of limbs and sockets converted, compared, and made a model of."""
 
+from itertools import chain, repeat
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -111,15 +112,10 @@ def model(
 def show_shape_model(figures: ShapeModelResult) -> None:
     """The figures of a model, mode by mode."""
     print_line(f"{figures.limbs} limbs of {figures.points} points: {', '.join(figures.bodies)}")
-    left_out = figures.left_out_mm or ()
+    modes = zip(figures.explained, figures.deviation_mm, chain(figures.left_out_mm or (), repeat(None)))
     rows = [
-        {
-            "mode": i + 1,
-            "share": 100 * share,
-            "move": move,
-            "left": left_out[i] if i < len(left_out) else None,
-        }
-        for i, (share, move) in enumerate(zip(figures.explained, figures.deviation_mm, strict=True))
+        {"mode": number, "share": 100 * share, "move": move, "left": left}
+        for number, (share, move, left) in enumerate(modes, 1)
     ]
     columns: dict[str, Column] = {
         "modes": "mode",

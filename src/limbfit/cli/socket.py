@@ -95,11 +95,8 @@ def show_socket(found: SocketResult) -> None:
             f"95 %: with what relaxation may do until the socket has been worn for {found.worn_s:g} s"
         )
     for row in (row for row in found.agreement if row.region == "all"):
-        limits = (
-            f" (95 % limits of agreement {console.format_ends(row.limits_kPa, '.1f')})"
-            if row.limits_kPa
-            else ""
-        )
+        ends = console.format_ends(row.limits_kPa, ".1f")
+        limits = f" (95 % limits of agreement {ends})" if ends else ""
         inside = f"{row.within_percent:.0f} % of {row.cells} cells within error and interval"
         console.print_line(f"{row.load}: model minus measured {row.bias_kPa:.1f} kPa{limits}; {inside}")
     balance = f"contact balances the loads within {found.balance_percent:.2g} %"

@@ -128,11 +128,8 @@ def _compare_rules(table: Any, names: Sequence[str], worst: dict[str, Array]) ->
     """Every rule beside the first, person by person."""
     first, found = names[0], []
     for name in names[1:]:
-        keys = [
-            key
-            for key in table[name].columns
-            if key in table[first].columns and key[2] in ("mean_kPa", "peak_kPa")
-        ]
+        both = [key for key in table[name].columns if key in table[first].columns]
+        keys = [key for key in both if key[2] in ("mean_kPa", "peak_kPa")]
         pairs = {key: (table[name][key] - table[first][key]).to_numpy() for key in keys}
         pairs = {(ANY_LOAD, WORST_PLACE, WORST_QUANTITY): worst[name] - worst[first]} | pairs
         for (load, place, quantity), pair in pairs.items():
@@ -186,9 +183,8 @@ def _find_drivers(
     sample = import_extra("SALib.sample.sobol", "population")
     people, notes = People(trial), list[str]()
     names = list(people.names)
-    given = rows[
-        (rows["place"] == INPUT) & rows["person"].isin(numbers) & (rows["rule"] == trial.rules[0].name)
-    ]
+    is_first = rows["rule"] == trial.rules[0].name
+    given = rows[(rows["place"] == INPUT) & rows["person"].isin(numbers) & is_first]
     columns = given.pivot_table(index="person", columns="quantity", values="value")[names]
     inputs = people.to_features(columns.to_numpy())
     surrogates, drivers = list[SurrogateFit](), list[Driver]()

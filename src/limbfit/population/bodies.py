@@ -41,10 +41,7 @@ class LimbBodies:
 def read_bodies(paths: Sequence[Path], unit: str = "mm") -> list[LimbBodies]:
     """Read limbs that are in correspondence.
 
-    Raises
-    ------
-    InputError
-        For limbs whose bodies or triangles differ, and as `read_surface` and `name_bodies`.
+    Raises `InputError` for limbs whose bodies or triangles differ, and as `read_surface` and `name_bodies`.
     """
     first, *others = [_read_limb(path, unit) for path in paths]
     rounded = np.round(first.points, 6)  # points that coincide are one
@@ -53,24 +50,17 @@ def read_bodies(paths: Sequence[Path], unit: str = "mm") -> list[LimbBodies]:
     faces = {name: index[own] for name, own in first.faces.items()}
     if ALL in faces:
         faces = name_bodies(Surface(merged, faces[ALL]), paths[0])
-    limbs = [LimbBodies(merged, faces)]
+    limbs, remedy = [LimbBodies(merged, faces)], "give limbs in correspondence, or add --register"
     for path, limb in zip(paths[1:], others, strict=True):
         alike = [np.array_equal(limb.faces.get(name, ()), own) for name, own in first.faces.items()]
         if len(limb.faces) != len(alike) or not all(alike):
-            raise InputError(
-                f"its triangles are not those of {paths[0]}",
-                file=path,
-                remedy="give limbs in correspondence, or add --register",
-            )
+            raise InputError(f"its triangles are not those of {paths[0]}", file=path, remedy=remedy)
         moved = np.zeros_like(merged)
         moved[index] = limb.points
         apart = np.linalg.norm(moved[index] - limb.points, axis=1)
         if apart.max() > SAME_POINT_MM:
-            raise InputError(
-                f"points that {paths[0]} joins are {apart.max():.2g} mm apart",
-                file=path,
-                remedy="give limbs in correspondence, or add --register",
-            )
+            what = f"points that {paths[0]} joins are {apart.max():.2g} mm apart"
+            raise InputError(what, file=path, remedy=remedy)
         limbs.append(LimbBodies(moved, faces))
     return limbs
 
@@ -98,12 +88,8 @@ def register_limbs(paths: Sequence[Path], unit: str = "mm") -> tuple[list[LimbBo
     """Bring limbs into correspondence: the first one, remeshed, is bent onto each of the others.
 
     The bending is that of Amberg, Romdhani and Vetter (CVPR 2007), by trimesh, body by body. How well each
-    limb was met are the distances (n,) of its points from the bent template, mm.
-
-    Raises
-    ------
-    InputError
-        For limbs with other bodies than the first, and as `read_bodies`.
+    limb was met are the distances (n,) of its points from the bent template, mm. Raises `InputError` for
+    limbs with other bodies than the first, and as `read_bodies`.
     """
     registration = import_extra("trimesh.registration", "population")
     mesh = import_extra("trimesh", "population").Trimesh
@@ -114,9 +100,8 @@ def register_limbs(paths: Sequence[Path], unit: str = "mm") -> tuple[list[LimbBo
     for path, limb in zip(paths, limbs, strict=True):
         odd = sorted(limb.faces.keys() ^ template.faces.keys())
         if odd:
-            raise InputError(
-                f"only one of it and {paths[0]} has a {odd[0]}", file=path, remedy="leave it out"
-            )
+            what = f"only one of it and {paths[0]} has a {odd[0]}"
+            raise InputError(what, file=path, remedy="leave it out")
         points, far = template.points.copy(), []
         for name, faces in template.faces.items():
             source, target = template.extract(name), limb.extract(name)

@@ -98,10 +98,8 @@ class People:
         weight = self.trial.weight.median_N * self.trial.weight.factor ** float(norm.ppf(last[0]))
         liner = self._liners[0] + (self._liners[1] - self._liners[0]) * float(last[1])
         found = [*self.source.to_inputs(shapes), *values, weight, liner]
-        inputs = {
-            name: float(value) for name, value in zip(self.names, found)
-        }  # without a liner that all have
-        return Person(number, inputs, liner)
+        # Without a liner that all have.
+        return Person(number, dict(zip(self.names, map(float, found))), liner)
 
     def to_features(self, inputs: Array) -> Array:
         """Inputs (..., d) for a surrogate: of tissues and weight, which are lognormal, the logarithms."""
@@ -133,9 +131,8 @@ class People:
             **{name: table for name, table in self.tables.items() if name != "socket"},
             "surfaces": {"skin": f"../{SURFACES}/skin.stl", "bones": bones},
             "execution": {"workers": 1},  # people, not their simulations, run side by side
-            "sites": [
-                {"name": "1", "position": front.round(3).tolist(), "depth_mm": 5.0}
-            ],  # studies have one
+            # Studies have a site.
+            "sites": [{"name": "1", "position": front.round(3).tolist(), "depth_mm": 5.0}],
             "socket": socket
             | ({"body_weight_N": round(person.inputs[WEIGHT], 3)} if bears_weight else {})
             | {"liner": {"thickness_mm": thickness} | material},
@@ -154,10 +151,7 @@ class People:
         return values
 
     def check_limb(self, anatomy: Anatomy) -> None:
-        """Refuse a limb whose bones are nearer to the skin than ``shapes.least_tissue_mm``.
-
-        Raises `SurfaceError`.
-        """
+        """Raise `SurfaceError` for bones nearer to the skin than ``shapes.least_tissue_mm``."""
         least = self.trial.shapes.least_tissue_mm
         for name, bone in anatomy.bones.items():
             inside = bone.points[anatomy.height(bone.points) < -least]

@@ -117,14 +117,8 @@ def _draw_regions(rows: Sequence[Quantity], rules: Sequence[str], load: str) -> 
         shown = [(k, own[place]) for k, place in enumerate(places) if place in own]
         y = np.array([k for k, _ in shown]) + 0.22 * (i - 0.5 * (len(rules) - 1))
         ax.hlines(y, [row.p5 for _, row in shown], [row.p95 for _, row in shown], color=style["color"])
-        ax.plot(
-            [row.median for _, row in shown],
-            y,
-            ls="",
-            marker=style["marker"],
-            color=style["color"],
-            label=rule,
-        )
+        median = [row.median for _, row in shown]
+        ax.plot(median, y, ls="", marker=style["marker"], color=style["color"], label=rule)
     set_rows(ax, places)
     ax.set(xlabel="Mean pressure (kPa)")
     ax.set_xlim(left=0.0)

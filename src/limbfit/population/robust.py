@@ -29,19 +29,14 @@ _SEARCHED = 256  # people over which the percentile is predicted
 def find_robust_rule(trial: Trial, people: int, fresh: int, listener: Listener) -> RobustRule:
     """Fit the surrogate to ``people``, search it, and check what it prefers on so many ``fresh`` ones.
 
-    Raises
-    ------
-    InputError
-        Where the trial states no ``[robust]``, or keys that the first rule does not have.
-    RunError
-        Where too few people could be simulated.
+    Raises `InputError` where the trial states no ``[robust]``, or keys that the first rule does not have; and
+    `RunError` where too few people could be simulated.
     """
     if trial.robust is None:
         raise InputError("the trial does not say what may change", file=trial.file, place="robust.ranges")
     if people < LEAST_PEOPLE or fresh < 2:
-        raise InputError(
-            f"{people} and {fresh} people are too few", remedy=f"give {LEAST_PEOPLE} and 2 or more"
-        )
+        what, remedy = f"{people} and {fresh} people are too few", f"give {LEAST_PEOPLE} and 2 or more"
+        raise InputError(what, remedy=remedy)
     keys = list(trial.robust.ranges)
     low, high = np.array(list(trial.robust.ranges.values())).T
     change_rule(trial, keys, low)  # refuses keys of areas that are not there
@@ -93,10 +88,7 @@ def find_robust_rule(trial: Trial, people: int, fresh: int, listener: Listener) 
 def change_rule(trial: Trial, keys: Sequence[str], values: Array, name: str = NAME) -> RuleTable:
     """The trial's first rule with other values of some keys.
 
-    Raises
-    ------
-    InputError
-        For the depth of an area that the rule does not have.
+    Raises `InputError` for the depth of an area that the rule does not have.
     """
     socket = deepcopy(trial.rules[0].socket)
     for key, value in zip(keys, map(float, values), strict=True):
@@ -107,8 +99,7 @@ def change_rule(trial: Trial, keys: Sequence[str], values: Array, name: str = NA
         area = next((one for one in socket.get("areas", ()) if one.get("name") == place), None)
         if area is None:
             what = f"the rule {trial.rules[0].name!r} has no area {place!r}"
-            raise InputError(
-                what, file=trial.file, place="robust.ranges", remedy="name one of rules.socket.areas"
-            )
+            remedy = "name one of rules.socket.areas"
+            raise InputError(what, file=trial.file, place="robust.ranges", remedy=remedy)
         area["depth_mm"] = value
     return RuleTable(name=name, socket=socket)

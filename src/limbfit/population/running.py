@@ -96,10 +96,7 @@ class TrialStore:
             frame.to_parquet(stream, index=False)
 
     def drop_stale(self) -> None:
-        """Delete rows of people that no rule's digest knows any more.
-
-        People of the search for a robust rule, whose numbers are apart, are kept.
-        """
+        """Delete rows that no rule's digest knows any more, but for the search for a robust rule."""
         known = [_split_name(self.file(0, rule))[1] for rule in self.trial.rules]
         for file in self.folder.glob("*.parquet"):
             number, end = _split_name(file)
@@ -201,10 +198,8 @@ def _write_skin_pressure(folder: Path, points: Array, found: SocketResult) -> No
     outer = np.unique(np.asarray(grids[0].field_data["face_set:skin"])[:, :3])
     far, near = cKDTree(np.asarray(grids[0].points)[outer]).query(points)
     reached = far < _NEAR_MM + found.socket.liner.thickness_mm
-    pressure = [
-        np.where(reached, np.asarray(grid.point_data["pressure_kPa"])[outer[near]], 0.0) for grid in grids
-    ]
-    np.save(folder / f"{FIELDS}.npy", np.array(pressure, dtype=np.float32))
+    pressure = np.array([grid.point_data["pressure_kPa"] for grid in grids], dtype=np.float32)
+    np.save(folder / f"{FIELDS}.npy", np.where(reached, pressure[:, outer[near]], np.float32(0.0)))
 
 
 def run_people(
@@ -218,22 +213,16 @@ def run_people(
     """Simulate people until so many wear the socket of every rule, of the trial or stated; their numbers.
 
     Those who were rejected, or for whom a simulation failed, do not count: others follow, from number
-    ``first`` on. What is stored is not done again.
-
-    Raises
-    ------
-    RunError
-        Where hardly anybody remains, or another process runs the trial.
+    ``first`` on. What is stored is not done again. Raises `RunError` where hardly anybody remains, or another
+    process runs the trial.
     """
     chosen, store = tuple(rules) or trial.rules, TrialStore(trial)
     ended, following = list[int](), first
     while len(ended) < wanted:
         if following - first >= _MOST_DRAWN * wanted + 8:
             rows = store.read(chosen)
-            lost = rows[rows["state"] != DONE].drop_duplicates(["person", "rule"])
-            reason = (
-                "" if lost.empty else f"; the last one: {lost.iloc[-1]['state']}, {lost.iloc[-1]['text']}"
-            )
+            lost = rows[rows["state"] != DONE].drop_duplicates(["person", "rule"])[-1:]
+            reason = "".join(f"; the last one: {row.state}, {row.text}" for row in lost.itertuples())
             counts = f"{len(ended)} of {following - first}"
             raise RunError(f"{trial.file}: only {counts} people could be simulated{reason}")
         numbers = range(following, following + wanted - len(ended))

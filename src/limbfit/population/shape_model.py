@@ -29,13 +29,10 @@ FACES = "faces_"  # before the name of a body, in the file
 
 @dataclass(frozen=True, eq=False)
 class ShapeModel:
-    """A mean limb and its modes.
+    """A mean limb, its bodies in LPS mm with n points in all, and its modes.
 
-    Attributes
-    ----------
-    mean : bodies in LPS mm, n points in all.
-    modes : (k, n, 3) mm, each of one standard deviation.
-    figures : how good the model is, as it was made.
+    ``modes`` (k, n, 3) are in mm, each of one standard deviation. ``figures``: how good the model is, as it
+    was made.
     """
 
     mean: LimbBodies
@@ -62,12 +59,9 @@ class ShapeModel:
                 faces: dict[str, Indices] = {key.removeprefix(FACES): stored[key] for key in names}
                 figures = ShapeModelResult.model_validate(json.loads(str(stored["figures"])))
                 return cls(LimbBodies(stored["mean"], faces), stored["modes"], figures)
-        except FileNotFoundError:
-            raise InputError(
-                "no such shape model", file=file, remedy="limbfit shapes model makes one"
-            ) from None
         except (OSError, ValueError, KeyError) as error:
-            what = f"this is no shape model: {error}"
+            is_there = not isinstance(error, FileNotFoundError)
+            what = f"this is no shape model: {error}" if is_there else "no such shape model"
             raise InputError(what, file=file, remedy="limbfit shapes model makes one") from None
 
 
@@ -81,6 +75,8 @@ def build_shape_model(
 ) -> ShapeModel:
     """Build a shape model of limbs.
 
+    Raises `InputError` for too few limbs, an unknown unit, and as `read_bodies` and `register_limbs`.
+
     Parameters
     ----------
     limbs : files with all bodies of a limb in each, or folders with a file for each body; z is proximal.
@@ -88,11 +84,6 @@ def build_shape_model(
     register : they are not in correspondence: bend the first one onto the others.
     mean : they are no people but ``at`` standard deviations of the modes of a model with this mean, to
         either side or to one.
-
-    Raises
-    ------
-    InputError
-        For too few limbs, an unknown unit, and as `read_bodies` and `register_limbs`.
     """
     if unit not in UNITS_MM:
         raise InputError(f"unknown unit {unit!r}", remedy=f"use one of {', '.join(UNITS_MM)}")

@@ -64,10 +64,8 @@ class DrawnLinerTable(TomlTable):
     material: Literal["silicone", "gel"] = "silicone"
 
     def check_keys(self) -> None:
-        if (
-            isinstance(self.thickness_mm, tuple)
-            and not 0 <= self.thickness_mm[0] < self.thickness_mm[1] <= 20
-        ):
+        stated = self.thickness_mm
+        if isinstance(stated, tuple) and not 0 <= stated[0] < stated[1] <= 20:
             raise ValueError("thickness_mm: give two thicknesses from 0 to 20, the smaller one first")
 
 
@@ -122,14 +120,11 @@ class Trial(TomlFile):
             raise ValueError("rules is empty; give one way of making a socket or more")
         if doubled := find_repeated(rule.name for rule in self.rules):
             raise ValueError(f"rules: names must differ; given twice: {doubled[0]}")
-        for place, table in (
-            ("person.socket", self.person.get("socket", {})),
-            *((r.name, r.socket) for r in self.rules),
-        ):
+        sockets = [(rule.name, rule.socket) for rule in self.rules]
+        for place, table in (("person.socket", self.person.get("socket", {})), *sockets):
             if own := sorted(OWN_KEYS.intersection(table)):
-                raise ValueError(
-                    f"{place}: {own[0]} is not for a rule: weight and liner have tables of their own"
-                )
+                what = f"{place}: {own[0]} is not for a rule"
+                raise ValueError(f"{what}: weight and liner have tables of their own")
         if own := sorted({"study", "surfaces", "image", "sites", "execution"}.intersection(self.person)):
             raise ValueError(f"person: the table {own[0]} is written for each person; leave it out")
 
@@ -137,10 +132,7 @@ class Trial(TomlFile):
 def load_trial(path: str | Path) -> Trial:
     """Read and check a trial; ``path`` is its file or folder.
 
-    Raises
-    ------
-    StudyError
-        With the file, the key and the remedy.
+    Raises `StudyError` with the file, the key and the remedy.
     """
     file = Path(path)
     file = file / FILE if file.is_dir() else file

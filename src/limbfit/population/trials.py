@@ -40,14 +40,8 @@ def write_trial(
 ) -> Path:
     """Write a ``population.toml`` into a folder, with its keys explained; the path of the file.
 
-    Parameters
-    ----------
-    model, limbs : a shape model, or a folder of limbs; by default limbs are the phantom's.
-
-    Raises
-    ------
-    InputError
-        Where there is a trial already, or model or folder is not there.
+    ``model``, ``limbs``: a shape model, or a folder of limbs; by default limbs are the phantom's. Raises
+    `InputError` where there is a trial already, or model or folder is not there.
     """
     folder = Path(folder)
     file = folder / FILE
@@ -68,10 +62,7 @@ def write_trial(
 def check_trial(path: str | Path) -> dict[str, Any]:
     """Build the first person who is not rejected, and check the study with every socket; nothing is solved.
 
-    Raises
-    ------
-    InputError
-        For shapes, tissues, keys or a rule that cannot be used; a limb that no rule fits.
+    Raises `InputError` for shapes, tissues, keys or a rule that cannot be used; a limb that no rule fits.
     """
     trial = load_trial(path)
     import_pandas()
@@ -89,17 +80,10 @@ def check_trial(path: str | Path) -> dict[str, Any]:
         except InputError as error:
             reason = error
             continue
-        return {
-            "trial": str(trial.file),
-            "person": number,
-            "inputs": dict(person.inputs),
-            "rules": len(trial.rules),
-        }
-    raise InputError(
-        f"none of the first {_TRIED} people can be simulated; the last one: {reason}",
-        file=trial.file,
-        remedy="change shapes, or the rule",
-    )
+        found = {"trial": str(trial.file), "person": number, "inputs": dict(person.inputs)}
+        return found | {"rules": len(trial.rules)}
+    what = f"none of the first {_TRIED} people can be simulated; the last one: {reason}"
+    raise InputError(what, file=trial.file, remedy="change shapes, or the rule")
 
 
 def run_population(
@@ -111,22 +95,10 @@ def run_population(
 ) -> dict[str, Any]:
     """Simulate the people of a trial, and write its answers and the report. What is stored is not done again.
 
-    Parameters
-    ----------
-    people : how many; by default as the trial says.
-    within_percent : end as soon as every share over a limit is known so well, either way.
-
-    Returns
-    -------
-    dict
-        What ``results/population.json`` holds, and ``report``.
-
-    Raises
-    ------
-    InputError
-        For a trial that cannot be used, or ``within_percent`` without limits.
-    RunError
-        Where hardly anybody remains, or another process runs the trial.
+    ``people``: how many; by default as the trial says. ``within_percent``: end as soon as every share over a
+    limit is known so well, either way. Returns what ``results/population.json`` holds, and ``report``. Raises
+    `InputError` for a trial that cannot be used, or ``within_percent`` without limits; and `RunError` where
+    hardly anybody remains, or another process runs the trial.
     """
     trial = load_trial(path)
     import_pandas()
@@ -134,9 +106,8 @@ def run_population(
     if wanted < 1:
         raise InputError(f"{wanted} people are too few", place="--people", remedy="give one or more")
     if within_percent is not None and not trial.limits:
-        raise InputError(
-            "the trial states no limit", file=trial.file, place="limits", remedy="state [[limits]]"
-        )
+        what, remedy = "the trial states no limit", "state [[limits]]"
+        raise InputError(what, file=trial.file, place="limits", remedy=remedy)
     TrialStore(trial).drop_stale()
     if within_percent is None:
         run_people(trial, wanted, listener=listener)
@@ -144,8 +115,7 @@ def run_population(
         for count in [*range(_BATCH, wanted, _BATCH), wanted]:
             run_people(trial, count, listener=listener)
             reached = measure_precision(trial)
-            words = f"{count} people: shares within {reached:.1f} %"
-            listener(Progress("people", count, wanted, words))
+            listener(Progress("people", count, wanted, f"{count} people: shares within {reached:.1f} %"))
             if reached <= within_percent:
                 break
     return report_population(path)
@@ -186,10 +156,7 @@ def count_people(path: str | Path) -> dict[str, Any]:
 def open_person(path: str | Path, number: int, *, listener: Listener = ignore_progress) -> dict[str, Any]:
     """The studies of a person, by rule, each with its report; simulated where they are not there yet.
 
-    Raises
-    ------
-    InputError
-        For a number below 1, or a person who was rejected.
+    Raises `InputError` for a number below 1, or a person who was rejected.
     """
     trial = load_trial(path)
     if number < 1:
@@ -214,22 +181,11 @@ def make_robust(
 ) -> dict[str, Any]:
     """Search the rule that lowers the 90th percentile of the worst pressure, and check it on fresh people.
 
-    Parameters
-    ----------
-    people : how many, each with another rule within ``robust.ranges``, the surrogate is fitted to.
-    fresh : how many wear the socket of the rule that was found, and that of the first rule.
-
-    Returns
-    -------
-    dict
-        What ``results/population.json`` holds, and ``report``.
-
-    Raises
-    ------
-    InputError
-        Where the trial states no ``[robust]``, or its keys are not those of the first rule.
+    ``people``: how many, each with another rule within ``robust.ranges``, the surrogate is fitted to.
+    ``fresh``: how many wear the socket of the rule that was found, and that of the first rule. Returns what
+    ``results/population.json`` holds, and ``report``. Raises `InputError` where the trial states no
+    ``[robust]``, or its keys are not those of the first rule.
     """
     trial = load_trial(path)
     run_people(trial, 2, listener=listener)  # the answers of the trial itself stand beside the rule
-    robust = find_robust_rule(trial, people, fresh, listener)
-    return _store_answers(trial, robust)
+    return _store_answers(trial, find_robust_rule(trial, people, fresh, listener))

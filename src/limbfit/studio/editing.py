@@ -70,10 +70,16 @@ def add_site(file: Path, name: str, values: Mapping[str, Any]) -> None:
         _append(sites, {"name": name, **values})
 
 
-def remove_site(file: Path, name: str) -> None:
-    """Take a site out of the study; its record stays where it is."""
+def remove_table(file: Path, place: str, name: str) -> None:
+    """Take a site (of ``sites``) or an area (of ``socket.areas``) out of the study file.
+
+    The record of a site stays where it is. Raises `StudyError` where there is none of that name.
+    """
     with edit_study(file) as document:
-        document["sites"].remove(_find(document.get("sites", []), name, file, "sites"))
+        rows: Any = document
+        for key in place.split("."):
+            rows = rows.get(key, {})
+        rows.remove(_find(rows, name, file, place))
 
 
 def set_area(file: Path, name: str, values: Mapping[str, Any]) -> None:
@@ -85,13 +91,6 @@ def set_area(file: Path, name: str, values: Mapping[str, Any]) -> None:
             _assign(area, values)
             return
         _append(rows, {"name": name, **values})
-
-
-def remove_area(file: Path, name: str) -> None:
-    """Take an area out of the study file. Raises `StudyError` where there is none of that name."""
-    with edit_study(file) as document:
-        rows = document.get("socket", {}).get("areas", [])
-        rows.remove(_find(rows, name, file, "socket.areas"))
 
 
 def set_trimline(file: Path, points: Sequence[Sequence[float]] | None) -> None:

@@ -16,7 +16,7 @@ from ..acquire.recording import Check
 from ..errors import TraceError
 from ..pipeline.commands.acquire import FOLDER as ACQUIRED
 from ..pipeline.commands.acquire import RECORD, VERDICT
-from .folder import Json, StudyFolder, resolve_inside
+from .folder import Json, resolve_inside
 from .study_routes import Folder
 
 router = APIRouter(prefix="/api/live")
@@ -40,7 +40,9 @@ class StoredVerdict(BaseModel):
 @router.get("")
 def get_session(folder: Folder) -> Json:
     """The newest session that is being recorded, else the newest that ended lately; null if none."""
-    recent = [(age, file.parent) for age, file in _list_records(folder) if age < RECENT_S]
+    begun = (folder.folder / ACQUIRED).glob(f"*/*/{RECORD}")
+    files = [file for file in begun if _STAMP.fullmatch(file.parent.name)]
+    recent = [(age, file.parent) for file in files if (age := _compute_age(file)) < RECENT_S]
     if not recent:
         return {"session": None}
     _, newest = max(recent, key=lambda session: (session[0] < SILENT_S, session[1].name))
@@ -69,12 +71,6 @@ def get_part(folder: Folder, site: str, stamp: str, offset: Offset = 0) -> Json:
     }
 
 
-def _list_records(folder: StudyFolder) -> list[tuple[float, Path]]:
-    """Records that were begun, with their ages in s."""
-    files = (folder.folder / ACQUIRED).glob(f"*/*/{RECORD}")
-    return [(_compute_age(file), file) for file in files if _STAMP.fullmatch(file.parent.name)]
-
-
 def _compute_age(file: Path) -> float:
     return max(time.time() - file.stat().st_mtime, 0.0)
 
@@ -82,10 +78,8 @@ def _compute_age(file: Path) -> float:
 def _read(part: Recording, file: Path, first: bool) -> Json:
     try:
         settings = part.head["settings"]
-        pin, limit_N = (
-            range(part.position_um.shape[1])[int(settings["pin"]) - 1],
-            float(settings["force_limit_N"]),
-        )
+        pin = range(part.position_um.shape[1])[int(settings["pin"]) - 1]
+        limit_N = float(settings["force_limit_N"])
         ramps = int(settings["precondition"]) + int(settings["repeats"])
         phases = [_describe_phase(event) for event in part.events if event["event"] == "phase"]
         if not math.isfinite(limit_N):

@@ -21,7 +21,7 @@ from ..pipeline.limb.surfaces import read_given_anatomy
 from ..results.limb import MeshResult, PlacedSite, SitesResult
 from ..study import Site, Study
 from ..web import build_patient_frame, compute_cell_quality, extract_interface, to_volume_shape
-from .editing import add_site, remove_site, set_site
+from .editing import add_site, remove_table, set_site
 from .folder import Json, StudyFolder, compute_fingerprint
 from .study_routes import Folder, StrictModel, respond_block
 
@@ -118,9 +118,8 @@ def post_markers(folder: Folder, depth_mm: Annotated[float, Body(embed=True, gt=
     study = folder.load()
     anatomy, marked = read_anatomy(folder, study), folder.results / "segment" / MARKED_SKIN
     if anatomy is None or not marked.is_file():
-        raise InputError(
-            "no skin with markers is known", remedy="state image.markers, and run until surfaces"
-        )
+        remedy = "state image.markers, and run until surfaces"
+        raise InputError("no skin with markers is known", remedy=remedy)
     places = [site.position or site.near for site in study.sites]
     numbers = (name for n in count(1) if (name := f"{n:02d}") not in {site.name for site in study.sites})
     for marker in find_markers(read_surface(marked), anatomy.skin):
@@ -144,7 +143,7 @@ def post_change(folder: Folder, name: str, change: SiteChange) -> Json:
 @router.post("/sites/{name}/remove")
 def post_removal(folder: Folder, name: str) -> Json:
     """Take a site out of the study file; its record stays."""
-    remove_site(folder.file, name)
+    remove_table(folder.file, "sites", name)
     return get_scene(folder)
 
 

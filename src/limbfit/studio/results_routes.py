@@ -3,6 +3,7 @@
 import re
 import shutil
 import tempfile
+from collections.abc import Iterator
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -100,7 +101,7 @@ def get_outcome(folder: Folder, kept: str | None = None) -> Json:
 def get_site(folder: Folder, site: str) -> Json:
     """The stored fields and files of a site, and the state of its simulation."""
     return {
-        "sources": _list_sources(folder, folder.load().indentation(site).name),
+        "sources": list(_iterate_sources(folder, folder.load().indentation(site).name)),
         "downloads": _list_site_downloads(folder, site),
         "simulating": processes.find_simulating(folder),
         "failure": processes.read_failure(folder, site),
@@ -224,13 +225,12 @@ def _find_kept_run(folder: StudyFolder, name: str) -> Path:
     return folder.artefact(KEPT, name, ABOUT).parent
 
 
-def _list_sources(folder: StudyFolder, site: str) -> list[Json]:
+def _iterate_sources(folder: StudyFolder, site: str) -> Iterator[Json]:
     """The stored fields of a site: every step of a simulation, or the deepest point of the prediction.
 
     Each has ``source``, ``title``, ``times_s``, ``deepest`` (which of them), ``parameters_from``, and
     ``mark``, which other fields change.
     """
-    sources = []
     moments = _list_moments(folder, site)
     if moments:
         times_s = [time for time, _ in moments]
@@ -238,18 +238,20 @@ def _list_sources(folder: StudyFolder, site: str) -> list[Json]:
         of = simulated and simulated.parameters_from
         if simulated and not is_current(simulated, CalibrationResult.find(folder.results)):
             of = f"{of}, before the study was identified anew"
-        source = {
+        curve, deepest = folder.results / "simulate" / f"{site}.csv", len(times_s) - 1
+        if curve.is_file():  # else the simulation goes on
+            deepest = int(np.argmin(np.abs(np.array(times_s) - _find_peak_time(curve))))
+        yield {
             "source": "simulate",
             "title": "every step, simulated",
             "times_s": times_s,
-            "deepest": _find_deepest(folder, site, times_s),
+            "deepest": deepest,
             "parameters_from": of,
             "mark": compute_fingerprint(file for _, file in moments),
         }
-        sources.append(source)
     predicted = folder.results / "predict" / f"{site}.vtu"
     if predicted.is_file():
-        source = {
+        yield {
             "source": "predict",
             "title": "the deepest point, predicted",
             "times_s": [_find_peak_time(folder.artefact("predict", f"{site}.csv"))],
@@ -257,8 +259,6 @@ def _list_sources(folder: StudyFolder, site: str) -> list[Json]:
             "parameters_from": "identified",
             "mark": compute_fingerprint([predicted]),
         }
-        sources.append(source)
-    return sources
 
 
 def _list_moments(folder: StudyFolder, site: str) -> list[tuple[float, Path]]:
@@ -269,14 +269,6 @@ def _list_moments(folder: StudyFolder, site: str) -> list[tuple[float, Path]]:
     named = _FRAME.findall(collection.read_text(encoding="utf-8"))
     files = [(float(time), collection.with_suffix("") / name) for time, name in named]
     return [(time, file) for time, file in files if file.is_file()]
-
-
-def _find_deepest(folder: StudyFolder, site: str, times_s: list[float]) -> int:
-    """The moment nearest to the deepest point; the last one while the simulation goes on."""
-    curve = folder.results / "simulate" / f"{site}.csv"
-    if not curve.is_file():
-        return len(times_s) - 1
-    return int(np.argmin(np.abs(np.array(times_s) - _find_peak_time(curve))))
 
 
 def _find_peak_time(curve: Path) -> float:

@@ -43,6 +43,9 @@ def serve_studio(
 ) -> None:
     """Serve the page of a study until interrupted.
 
+    Raises `InputError` for a study that cannot be read, or an address that others reach, without ``expose``;
+    and `RunError` where the port is taken.
+
     Parameters
     ----------
     study : the study file or its folder; in a folder without one the page makes a study.
@@ -51,13 +54,6 @@ def serve_studio(
     expose : the study may be seen and changed by whoever reaches ``host`` and has the page's address.
     browser : open the page.
     tell : is given the page's address.
-
-    Raises
-    ------
-    InputError
-        For a study that cannot be read, or an address that others reach, without ``expose``.
-    RunError
-        Where the port is taken.
     """
     path = Path(study).absolute()
     folder = StudyFolder(path / "study.toml" if path.is_dir() else path)

@@ -20,7 +20,7 @@ from ..socket.rays import compute_profile
 from ..socket.rectify import Trim, find_brim, trim_limb, wrap_trimline
 from ..study import Study
 from ..web import build_patient_frame, to_volume_shape
-from .editing import remove_area, set_area, set_trimline
+from .editing import remove_table, set_area, set_trimline
 from .folder import Json, StudyFolder, compute_fingerprint
 from .identification_routes import describe_last_run
 from .model_routes import Place, Text, compute_surfaces_fingerprint, project_to_skin_of_study, read_anatomy
@@ -235,7 +235,7 @@ def post_area(folder: Folder, area: AreaRequest) -> Json:
 @router.post("/areas/{name}/remove")
 def post_removal(folder: Folder, name: str) -> Json:
     """Take an area out of the study file."""
-    remove_area(folder.file, name)
+    remove_table(folder.file, "socket.areas", name)
     return get_shape(folder)
 
 

@@ -48,13 +48,8 @@ def respond_block(arrays: Mapping[str, Any], facts: Mapping[str, Any] | None = N
 def get_study(folder: Folder) -> Json:
     """The name of the study, its sites, and its records and planned indentations, without paths of inputs."""
     if folder.is_new:
-        return {
-            "is_new": True,
-            "name": folder.folder.name,
-            "has_image": False,
-            "sites": [],
-            "indentations": [],
-        }
+        nothing: Json = {"has_image": False, "sites": [], "indentations": []}
+        return {"is_new": True, "name": folder.folder.name, **nothing}
     study = folder.load()
     return {
         "is_new": False,

@@ -35,7 +35,10 @@ def load_study(path: str | Path, *, recorded: bool = True) -> Study:
         raise StudyError("no such study", file=file, remedy="give a study.toml or the folder that holds one")
     content = read_toml(file)
     notes = _place_by_markups(content, file)
-    _load_extensions(content, file)
+    table = content.get("study")
+    named = table.get("extensions", []) if isinstance(table, dict) else []
+    if isinstance(named, list) and all(isinstance(name, str) for name in named):  # others are refused below
+        load_extensions(file.parent / name for name in named)
     with add_location(file=file):
         study = check_content(Study, content, "docs/study.md", file=str(file), notes=notes)
         for place, path in study.inputs.items():
@@ -45,7 +48,8 @@ def load_study(path: str | Path, *, recorded: bool = True) -> Study:
             if study.results.resolve().is_relative_to(at.resolve()):
                 what = f"{path} holds the results of the study, and so changes with every run"
                 raise StudyError(what, place=place, remedy="give it a folder of its own")
-        check_unused_keys(study, content)
+        for key, why, remedy in _find_unused_keys(study, content):
+            raise StudyError(f"without effect: {why}", place=key, remedy=remedy)
     unused = [name for name in study.indenters if name not in study.used_indenters]
     what = "no record names it; only limbfit design --protocol does"
     notes = (*notes, *(f"indenters.{name}: {what}" for name in unused))
@@ -101,14 +105,6 @@ def _place_by_markups(content: dict[str, Any], file: Path) -> tuple[str, ...]:
             site[table.get("gives", "position")] = points[name].tolist()
     unused = sorted(set(points) - {str(site.get("name")) for site in sites if isinstance(site, dict)})
     return (f"control points without a site: {', '.join(unused)}",) if unused else ()
-
-
-def _load_extensions(content: dict[str, Any], file: Path) -> None:
-    """Run the study's own Python files; what is malformed is left for the check of the types to refuse."""
-    table = content.get("study")
-    named = table.get("extensions", []) if isinstance(table, dict) else []
-    if isinstance(named, list) and all(isinstance(name, str) for name in named):
-        load_extensions(file.parent / name for name in named)
 
 
 def _build_study_error(error: ValidationError, content: dict[str, Any], page: str) -> StudyError:
@@ -178,16 +174,13 @@ _SOURCE_KEYS = ("layer_mm", "position_mm", "axis_degrees", "edge_radius_mm")
 UNUSED_KEYS: Rules = {
     ("segmentation",): UnusedKeys(lambda s: s.surfaces is not None, "[surfaces] are not segmented"),
     tuple(f"segmentation.{key}" for key in _AUTOMATIC_KEYS): UnusedKeys(
-        lambda s: s.segmentation.is_given,
-        "the study's own labels win over the automatic segmentation",
+        lambda s: s.segmentation.is_given, "the study's own labels win over the automatic segmentation"
     ),
     ("segmentation.min_bone_volume_mm3",): UnusedKeys(
-        lambda s: bool(s.segmentation.seeds),
-        "with seeds, the bones are those that have one, however small",
+        lambda s: bool(s.segmentation.seeds), "with seeds, the bones are those that have one, however small"
     ),
     ("segmentation.bias_correction",): UnusedKeys(
-        lambda s: s.segmentation.contrast == "CT",
-        "CT has no bias field",
+        lambda s: s.segmentation.contrast == "CT", "CT has no bias field"
     ),
     ("image.series",): UnusedKeys(
         lambda s: s.image is not None and s.path(s.image.path).is_file(),
@@ -217,8 +210,7 @@ UNUSED_KEYS: Rules = {
         "give geometry.amputation, or leave it out",
     ),
     ("geometry.bone_policy", "geometry.bone_clearance_mm"): UnusedKeys(
-        lambda s: s.surfaces is not None and not s.surfaces.bones,
-        "[surfaces] has no bones",
+        lambda s: s.surfaces is not None and not s.surfaces.bones, "[surfaces] has no bones"
     ),
     **_list_edge_rules("mesh", lambda s: s.mesh),
     **_list_edge_rules("mesh.coarse", lambda s: s.mesh.coarse),
@@ -232,8 +224,7 @@ UNUSED_KEYS: Rules = {
         "give sites.trace, or leave it out",
     ),
     ("calibration.relative_tolerance",): UnusedKeys(
-        lambda s: s.calibration.stopping == "paper",
-        'stopping = "paper" has limits of its own',
+        lambda s: s.calibration.stopping == "paper", 'stopping = "paper" has limits of its own'
     ),
     ("calibration.force_error_percent",): UnusedKeys(
         lambda s: s.calibration.objective == "paper" and not s.priors,
@@ -260,8 +251,7 @@ UNUSED_KEYS: Rules = {
         "give calibration.search_radius_mm or [mesh.coarse], or leave it out",
     ),
     tuple(f"uncertainty.{key}" for key in _SOURCE_KEYS): UnusedKeys(
-        lambda s: not s.uncertainty.sources,
-        "sources = false leaves it out",
+        lambda s: not s.uncertainty.sources, "sources = false leaves it out"
     ),
     ("uncertainty.edge_radius_mm",): UnusedKeys(
         lambda s: not any(SHAPES[one.shape].is_edge_doubted for one in s.used_indenters.values()),
@@ -283,8 +273,7 @@ UNUSED_KEYS: Rules = {
         f'give material.law = "{ACTIVE}", or leave it out',
     ),
     tuple(f"socket.{key}" for key in _SHAPE_KEYS): UnusedKeys(
-        lambda s: s.socket.file is not None,
-        "the socket's shape is that of socket.file",
+        lambda s: s.socket.file is not None, "the socket's shape is that of socket.file"
     ),
     ("socket.unit", "socket.space"): UnusedKeys(
         lambda s: s.socket.file is None,
@@ -292,8 +281,7 @@ UNUSED_KEYS: Rules = {
         "give socket.file, or leave it out",
     ),
     ("socket.distal_clearance_mm",): UnusedKeys(
-        lambda s: s.socket.distal == "bearing",
-        "the distal end bears",
+        lambda s: s.socket.distal == "bearing", "the distal end bears"
     ),
     ("socket.travel_mm",): UnusedKeys(
         lambda s: s.socket.donning == "growth",
@@ -301,16 +289,13 @@ UNUSED_KEYS: Rules = {
         'give donning = "insertion", or leave it out',
     ),
     ("socket.design.adapter_mm",): UnusedKeys(
-        lambda s: s.socket.design.adapter_diameter_mm == 0,
-        "a diameter of 0 mm is no adapter",
+        lambda s: s.socket.design.adapter_diameter_mm == 0, "a diameter of 0 mm is no adapter"
     ),
     tuple(f"socket.liner.{key}" for key in ("material", "c_kPa", "m", "gamma", "tau_s")): UnusedKeys(
-        lambda s: s.socket.liner.thickness_mm == 0,
-        "a liner of 0 mm is none",
+        lambda s: s.socket.liner.thickness_mm == 0, "a liner of 0 mm is none"
     ),
     ("socket.body_weight_N",): UnusedKeys(
-        lambda s: all(load.preset is None for load in s.socket.loads),
-        "no load is a preset",
+        lambda s: all(load.preset is None for load in s.socket.loads), "no load is a preset"
     ),
     ("execution.time_limit_s", "execution.memory_limit_GB"): UnusedKeys(
         lambda s: s.execution.workers == 1,
@@ -324,20 +309,17 @@ UNUSED_RECORD_KEYS: Rules = {
     ("ultrasound_sd_mm",): UnusedKeys(lambda s, one: one.ultrasound is None, "it has no ultrasound"),
     ("surface_sd_mm", "surface_frame"): UnusedKeys(lambda s, one: one.surface is None, "it has no surface"),
     ("shear_waves_sd_m_s", "shear_waves_bias_m_s"): UnusedKeys(
-        lambda s, one: one.shear_waves is None,
-        "it has no shear waves",
+        lambda s, one: one.shear_waves is None, "it has no shear waves"
     ),
 }
 
 UNUSED_SITE_KEYS: Rules = {
     ("weight",): UnusedKeys(lambda s, site: not s.records_at(site), "the site has no record to be weighted"),
     ("speed_mm_s",): UnusedKeys(
-        lambda s, site: bool(s.records_at(site)),
-        "the record says how fast the indenter was",
+        lambda s, site: bool(s.records_at(site)), "the record says how fast the indenter was"
     ),
     ("control",): UnusedKeys(
-        lambda s, site: site.trace is None,
-        "it is of the site's trace, and there is none",
+        lambda s, site: site.trace is None, "it is of the site's trace, and there is none"
     ),
     **UNUSED_RECORD_KEYS,
     ("indenter",): UnusedKeys(
@@ -357,14 +339,8 @@ UNUSED_SITE_KEYS: Rules = {
 }
 
 
-def check_unused_keys(study: Study, content: Mapping[str, Any]) -> None:
-    """Refuse, by a `StudyError`, keys that ``content``, the file as read, states without effect."""
-    for key, why, remedy in _find_unused_keys(study, content):
-        raise StudyError(f"without effect: {why}", place=key, remedy=remedy)
-
-
 def _find_unused_keys(study: Study, content: Mapping[str, Any]) -> Iterator[tuple[str, str, str]]:
-    """Each unused key with why it has no effect and what to do."""
+    """Each key that ``content``, the file as read, states without effect, with why and what to do."""
     for keys, rule in UNUSED_KEYS.items():
         for key in keys:
             if _is_stated(content, key) and rule.when(study):

@@ -10,8 +10,6 @@ from pydantic import Field
 
 from .tables import Direction, Positive, TomlTable, Vector
 
-Control = Literal["displacement", "force"]
-Frame = Literal["limb", "site"]
 RECORDED = ("trace", "ultrasound", "surface", "shear_waves")  # files of a record
 STORED_ENDINGS = ("raw", "layers", "surface", "waves", "model", "optimize")  # of a record's files in results
 _NAME = r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,39}$"
@@ -35,12 +33,12 @@ class _RecordKeys(TomlTable):
     touch_down_s: float | None = None
     peak_s: float | None = None
     indenter: str | None = None
-    control: Control = "displacement"
+    control: Literal["displacement", "force"] = "displacement"
     ultrasound: Path | None = None
     ultrasound_sd_mm: Positive = 0.1
     surface: Path | None = None
     surface_sd_mm: Positive = 0.05
-    surface_frame: Frame = "limb"
+    surface_frame: Literal["limb", "site"] = "limb"
     shear_waves: Path | None = None
     shear_waves_sd_m_s: Positive = 0.1
     shear_waves_bias_m_s: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.1

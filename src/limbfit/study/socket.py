@@ -18,11 +18,8 @@ LINERS: dict[str, dict[str, float]] = {
     "silicone": {"c_kPa": 100.0, "m": 2.0, "gamma": 0.1, "tau_s": 1.0},
     "gel": {"c_kPa": 40.0, "m": 2.0, "gamma": 0.3, "tau_s": 1.0},
 }
-
-
-# Names that results have for something else.
-TAKEN_NAMES = {"areas": set[str](), "loads": {"donning"}, "regions": {"the limb", "settling"}}
-TAKEN_NAMES |= {"measured": set()}
+# Names that results have for something else, of what has names.
+TAKEN_NAMES = {"areas": (), "loads": ("donning",), "regions": ("the limb", "settling"), "measured": ()}
 # Keys of `MeasuredTable` for sheets, and for those whose file does not state their layout.
 SHEET_KEYS, LAYOUT_KEYS = ("landmarks", "markups", "from_s", "to_s"), ("rows", "columns", "spacing_mm")
 
@@ -212,7 +209,7 @@ class SocketTable(TomlTable):
             names = [one.name for one in getattr(self, kind)]
             if doubled := find_repeated(names):
                 raise ValueError(f"{kind}: names must differ; given twice: {doubled[0]}")
-            if own := sorted(taken.intersection(names)):
+            if own := sorted({*taken} & {*names}):
                 raise ValueError(f"{kind}: {own[0]!r} is a name of the results' own; give another")
         loads = ["donning", *(load.name for load in self.loads)]
         for one in self.measured:

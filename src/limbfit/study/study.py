@@ -243,7 +243,6 @@ class Study(tables.TomlFile):
     def check_keys(self) -> None:
         self._check_records()
         self._check_measurements()
-        self._check_indenters()
         self._check_material()
         self._check_geometry()
 
@@ -266,6 +265,12 @@ class Study(tables.TomlFile):
             if (not records) == (site.depth_mm is None):
                 remedy = "give either trace (a record; several: [[records]]) or depth_mm (to be simulated)"
                 raise ValueError(f"{site.key}: {remedy}")
+        stated: list[Site | RecordTable] = [*self.sites, *self.records]
+        for one in stated:
+            if one.indenter is not None and one.indenter not in self.indenters:
+                known = ", ".join(self.indenters) or "none"
+                what = f"{one.key}: no indenter is named {one.indenter!r}"
+                raise ValueError(f"{what}; those of [indenters] are {known}")
 
     def _check_measurements(self) -> None:
         """Refuse what is measured where something else in the study rules it out."""
@@ -284,14 +289,6 @@ class Study(tables.TomlFile):
                 key, what = ("prestretch", "pre-stretch") if taut else ("activation", "contraction")
                 seen = one.observed if taut else "shear waves"
                 raise ValueError(f"material.{key}: {one.name} has {seen}, which sees no {what}; leave it out")
-
-    def _check_indenters(self) -> None:
-        stated: list[Site | RecordTable] = [*self.sites, *self.records]
-        for one in stated:
-            if one.indenter is not None and one.indenter not in self.indenters:
-                known = ", ".join(self.indenters) or "none"
-                what = f"{one.key}: no indenter is named {one.indenter!r}"
-                raise ValueError(f"{what}; those of [indenters] are {known}")
 
     def _check_material(self) -> None:
         layers = [layer.name for layer in self.geometry.model_layers]

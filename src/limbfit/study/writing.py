@@ -39,9 +39,8 @@ def create_study(folder: Path, new: NewStudy) -> Path:
     """Write a folder's study file. Raises `StudyError` where there is one, or it would not be valid."""
     file = folder / "study.toml"
     if file.exists():
-        raise StudyError(
-            "there is a study already", file=file, remedy="change that one, or choose another folder"
-        )
+        remedy = "change that one, or choose another folder"
+        raise StudyError("there is a study already", file=file, remedy=remedy)
     image = {key: getattr(new, key) for key in ("series", "markers", "markers_series")}
     tables = {
         "study": {"name": new.name},
@@ -56,9 +55,8 @@ def create_study(folder: Path, new: NewStudy) -> Path:
     if new.sites:
         document["sites"] = tomlkit.aot()
         for site in new.sites:
-            document["sites"].append(
-                tomlkit.item({key: value for key, value in site.items() if value is not None})
-            )
+            stated = {key: value for key, value in site.items() if value is not None}
+            document["sites"].append(tomlkit.item(stated))
     store_study(document, file)
     return file
 

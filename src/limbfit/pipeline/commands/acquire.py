@@ -118,9 +118,8 @@ def open_device(address: str, settings: acquire.Settings) -> acquire.Device:
         raise InputError(what, file=file, place="force.resolution_N", remedy=f"state touch_N = {least_N:g}")
     if settings.force_limit_N >= table.force.range_N:
         remedy = f"state acquire.force_limit_N below {table.force.range_N:g} N"
-        raise InputError(
-            "its force sensor ends before the limit", file=file, place="force.range_N", remedy=remedy
-        )
+        what = "its force sensor ends before the limit"
+        raise InputError(what, file=file, place="force.range_N", remedy=remedy)
     return Rig(table, find_check(file))
 
 

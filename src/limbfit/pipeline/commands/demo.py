@@ -73,11 +73,8 @@ def run_demo(folder: str | Path, *, seed: int = 0, listener: Listener = ignore_p
             make_phantom_study(folder, detail="coarse", seed=seed, listener=listener)
     truth = read_json(truth_file)
     if truth["seed"] != seed or truth["detail"] != "coarse":
-        raise InputError(
-            f"holds the phantom of seed {truth['seed']}, {truth['detail']}",
-            file=folder,
-            remedy="give another folder, or the same seed",
-        )
+        what = f"holds the phantom of seed {truth['seed']}, {truth['detail']}"
+        raise InputError(what, file=folder, remedy="give another folder, or the same seed")
     summary = run_study(load_study(folder), listener=listener)
     return {**summary, "truth": truth["parameters"]}
 

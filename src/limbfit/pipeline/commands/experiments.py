@@ -77,17 +77,21 @@ def _find_kind(value: Any) -> type | None:
 IDENTIFIED = "identified"  # where parameters are from
 _MESHED, _SIMULATED = ("sites", "traces", "mesh"), ("sites", "traces", "mesh", "calibrate")
 _TABLES = ("material", "solver", "indenter", "indenters", "clamps")
-_CALIBRATED = ("calibration", *_TABLES)
-_SOCKET = ("socket", "geometry", "mesh", "material")
+_CALIBRATED, _UNCERTAIN = ("calibration", *_TABLES), ("calibration", "uncertainty", *_TABLES)
+_ACQUIRED = ("calibration", "acquire", *_TABLES)
 # Keys of sites and of records.
+_WEIGHED = ("name", "fitted", "weight", "edge", "indenter")
 _FITTED = ("name", "region", "fitted", "weight", "edge", "indenter")
 _PLANNED = ("name", "fitted", "edge", "depth_mm", "speed_mm_s", "indenter")
 _VARIED = ("name", "region", "edge", "depth_mm", "speed_mm_s", "indenter")
 _RECORD = ("site", "name", "indenter")
+# What experiments stand on that choose fitted sites anew, and those of the socket.
+_CHOICES = (_SIMULATED, _CALIBRATED, _FITTED, _RECORD)
+_SOCKET = ("surfaces",), ("socket", "geometry", "mesh", "material")
 
 _OWN: tuple[Experiment, ...] = (
     Experiment("cube", run_cube, ("calibrate",), ("material",), check=check_cube),
-    Experiment("regions", run_regions, _SIMULATED, _CALIBRATED, _FITTED, _RECORD, check=check_regions),
+    Experiment("regions", run_regions, *_CHOICES, check=check_regions),
     *(
         Experiment(f"sensitivity-{name}", run, _SIMULATED, _TABLES, _VARIED, _RECORD, check=check)
         for name, run, check in (
@@ -98,41 +102,13 @@ _OWN: tuple[Experiment, ...] = (
             ("mesh", sensitivity.run_refinement, sensitivity.check_refinement),
         )
     ),
-    Experiment(
-        "uncertainty",
-        run_uncertainty,
-        (*_SIMULATED, "predict"),
-        ("calibration", "uncertainty", *_TABLES),
-        ("name", "fitted", "weight", "edge", "indenter"),
-        _RECORD,
-    ),
-    Experiment(
-        "crossvalidate",
-        run_crossvalidate,
-        _SIMULATED,
-        _CALIBRATED,
-        _FITTED,
-        _RECORD,
-        check=check_crossvalidate,
-    ),
+    Experiment("uncertainty", run_uncertainty, (*_SIMULATED, "predict"), _UNCERTAIN, _WEIGHED, _RECORD),
+    Experiment("crossvalidate", run_crossvalidate, *_CHOICES, check=check_crossvalidate),
     Experiment("design", run_design, _MESHED, _CALIBRATED, _PLANNED, _RECORD, check=check_design),
+    Experiment("protocol", run_protocol, _MESHED, _ACQUIRED, _PLANNED, _RECORD, check=check_protocol),
+    Experiment("socket", run_socket, *_SOCKET, apart=("socket.design",), check=check_socket),
     Experiment(
-        "protocol",
-        run_protocol,
-        _MESHED,
-        ("calibration", "acquire", *_TABLES),
-        _PLANNED,
-        _RECORD,
-        check=check_protocol,
-    ),
-    Experiment("socket", run_socket, ("surfaces",), _SOCKET, apart=("socket.design",), check=check_socket),
-    Experiment(
-        "socket_design",
-        run_socket_design,
-        ("surfaces",),
-        _SOCKET,
-        apart=("socket.measured",),
-        check=check_socket_design,
+        "socket_design", run_socket_design, *_SOCKET, apart=("socket.measured",), check=check_socket_design
     ),
 )
 EXPERIMENTS = Registry("experiment", {experiment.name: experiment for experiment in _OWN})
@@ -161,10 +137,7 @@ def register_experiment(experiment: Experiment, section: Maker | None = None) ->
 def check_experiment(
     experiment: Experiment, study: Study, limb: LimbGeometry | None, options: Mapping[str, Any]
 ) -> None:
-    """Refuse an experiment that its inputs rule out; ``limb``: None where it is not known yet.
-
-    Raises `InputError` with the remedy.
-    """
+    """Raise `InputError` for an experiment that inputs rule out; ``limb``: None where it is not known yet."""
     if set(experiment.needs) - {"segment", "surfaces"}:
         study.refuse_no_site()
     if "calibrate" in experiment.needs:

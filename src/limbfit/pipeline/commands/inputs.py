@@ -1,6 +1,5 @@
 """What lies in a folder that a study could name: images by series, surfaces, label maps, records."""
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,12 @@ from ...errors import ImageError, InputError
 from ...traces.formats import BINARY_SUFFIXES, TEXT_SUFFIXES
 from .acquire import FOLDER
 
-_SKIPPED = ("results", FOLDER)  # what limbfit has written
+_SKIPPED = {"results", FOLDER}  # what limbfit has written
+_SUFFIXES = {
+    "images": tuple(suffix for form in IMAGE_FORMATS for suffix in form.suffixes),
+    "surfaces": SUFFIXES,
+    "records": (*TEXT_SUFFIXES, *BINARY_SUFFIXES),
+}
 
 
 def list_inputs(folder: str | Path) -> dict[str, list[dict[str, Any]]]:
@@ -25,33 +29,20 @@ def list_inputs(folder: str | Path) -> dict[str, list[dict[str, Any]]]:
     root = Path(folder)
     if not root.is_dir():
         raise InputError("no such folder", file=root, remedy="name the folder of the new study")
-    found: dict[str, list[dict[str, Any]]] = {"images": [], "surfaces": [], "records": []}
+    found: dict[str, list[dict[str, Any]]] = {kind: [] for kind in _SUFFIXES}
     for place in [root, *(path for path in sorted(root.rglob("*")) if path.is_dir())]:
         below = place.relative_to(root)
-        if any(part.startswith(".") for part in below.parts) or below.parts[:1] in [
-            (one,) for one in _SKIPPED
-        ]:
+        if any(part.startswith(".") for part in below.parts) or set(below.parts[:1]) & _SKIPPED:
             continue
         files = sorted(path for path in place.iterdir() if path.is_file() and not path.name.startswith("."))
-        for kind, path in _classify_files(files):
-            found[kind].append({"path": path.relative_to(root).as_posix()})
+        for path in files:
+            name = path.name.lower()
+            for kind, suffixes in _SUFFIXES.items():
+                if name.endswith(suffixes) and not name.endswith(".seg.nrrd"):  # a label map
+                    found[kind].append({"path": path.relative_to(root).as_posix()})
         if any(is_dicom(path) for path in files[:3]):
             found["images"] += [{"path": below.as_posix(), **series} for series in _describe(place)]
     return found
-
-
-def _classify_files(files: list[Path]) -> Iterator[tuple[str, Path]]:
-    """Each file with its kind, by its suffix; files of another kind, and label maps, are left out."""
-    suffixes = {
-        "images": tuple(suffix for form in IMAGE_FORMATS for suffix in form.suffixes),
-        "surfaces": SUFFIXES,
-        "records": (*TEXT_SUFFIXES, *BINARY_SUFFIXES),
-    }
-    for path in files:
-        name = path.name.lower()
-        for kind, known in suffixes.items():
-            if name.endswith(known) and not name.endswith(".seg.nrrd"):
-                yield kind, path
 
 
 def _describe(folder: Path) -> list[dict[str, Any]]:

@@ -56,9 +56,8 @@ def _set_law(name: str, fibred: bool = False) -> Callable[[Study, Document], Non
 
     def change(study: Study, document: Document) -> None:
         if study.material.law != OGDEN:
-            raise InputError(
-                f'the study\'s law is "{study.material.law}"', remedy=f'only "{OGDEN}" has this alternative'
-            )
+            what = f'the study\'s law is "{study.material.law}"'
+            raise InputError(what, remedy=f'only "{OGDEN}" has this alternative')
         material = document.setdefault("material", tomlkit.table())
         material["law"] = name
         keys = set(LAWS[name].keys)
@@ -210,15 +209,11 @@ def compare_models(
     """Calibrate other models of the study on the same records, weigh them, and mix their predictions.
 
     A model takes about as long as the study's own calibration; what is stored already is not done again.
-
-    Returns what ``results/models/models.json`` holds, and ``folder``. Raises `InputError` for a model that
-    there is not, or that the study cannot have.
-
-    ``models``: names in `MODELS`, or "all".
+    ``models``: names in `MODELS`, or "all". Returns what ``results/models/models.json`` holds, and
+    ``folder``. Raises `InputError` for a model that there is not, or that the study cannot have.
     """
-    chosen = select_models(models)
     derived, left_out = {}, {}
-    for name in chosen:
+    for name in select_models(models):
         try:
             derived[name] = derive_study(study, name)
         except InputError as error:
@@ -304,16 +299,14 @@ def _mix_record(
 def fit_socket_of_models(study: Study, *, listener: Listener = ignore_progress) -> dict[str, Any]:
     """Put the socket on the limb with every model that counts, and mix the mean pressures of its regions.
 
-    The models are those that `compare_models` has weighed last, of at least `MIN_SOCKET_WEIGHT`.
-
-    Returns what ``results/models/socket.json`` holds, and ``folder``. Raises `InputError` if no models were
-    compared, or the study's own socket cannot be simulated.
+    The models are those that `compare_models` has weighed last, of at least `MIN_SOCKET_WEIGHT`. Returns what
+    ``results/models/socket.json`` holds, and ``folder``. Raises `InputError` if no models were compared, or
+    the study's own socket cannot be simulated.
     """
     compared = stored.ModelsResult.find(study.results)
     if compared is None:
-        raise InputError(
-            "no other models were compared", file=study.file, remedy="limbfit uncertainty --models all"
-        )
+        what, remedy = "no other models were compared", "limbfit uncertainty --models all"
+        raise InputError(what, file=study.file, remedy=remedy)
     names = [one.model for one in compared.models if one.model != OWN_MODEL]
     compare_models(study, names, listener=listener)  # anew where the study has changed
     compared = stored.ModelsResult.read(study.results)
@@ -335,15 +328,12 @@ def fit_socket_of_models(study: Study, *, listener: Listener = ignore_progress) 
 
 def _mix_pressures(sockets: Sequence[SocketResult], weights: Array) -> list[stored.MixedLoad]:
     """For donning and each load, the mean pressure of each region by every model, and of all."""
-    held = [socket.states for socket in sockets]
-    mixed = {
-        name: zip(*(states[name].regions for states in held), strict=True)  # each region by every model
-        for name in held[0]
-    }
-    return [
-        stored.MixedLoad(name=name, regions=[_mix_region(same, weights) for same in regions])
-        for name, regions in mixed.items()
-    ]
+    mixed = []
+    for name in sockets[0].states:
+        by_region = zip(*(socket.states[name].regions for socket in sockets), strict=True)  # of every model
+        regions = [_mix_region(same, weights) for same in by_region]
+        mixed.append(stored.MixedLoad(name=name, regions=regions))
+    return mixed
 
 
 def _mix_region(same: Sequence[LoadedRegion], weights: Array) -> stored.MixedPressure:

@@ -110,11 +110,8 @@ def plan_protocol(
     pressures = _read_socket_pressures(study) if SOCKET in determine else {}
     if pressures and (len(determine) > 1 or criterion == "D"):
         what = "with other parameters" if len(determine) > 1 else 'by the criterion "D"'
-        raise InputError(
-            f"pressures of a socket are not determined {what}: they are more than the parameters",
-            place="--determine",
-            remedy="state socket alone, and A or no criterion",
-        )
+        what = f"pressures of a socket are not determined {what}: they are more than the parameters"
+        raise InputError(what, place="--determine", remedy="state socket alone, and A or no criterion")
     used, origin = choose_parameters(study, parameters)
     times = time_socket_loads(study.socket) if pressures else {}
     if not len(holds_s):
@@ -228,13 +225,7 @@ def fit_socket(
         what = f"there is nothing to draw {samples} samples from: the parameters were not identified"
         raise InputError(what, place="--samples", remedy="identify them (limbfit run)")
     return run_experiment(
-        study,
-        "socket",
-        listener=listener,
-        parameters=used,
-        parameters_from=origin,
-        samples=samples,
-        **known,
+        study, "socket", listener=listener, parameters=used, parameters_from=origin, samples=samples, **known
     )
 
 

@@ -32,15 +32,13 @@ def reproduce_study(
 ) -> dict[str, Any]:
     """Copy the inputs of a study to a new folder, run it there, and compare.
 
+    ``record``: ``results/run.json`` of a study, or the study. ``folder``: the new one; must not exist, unless
+    an earlier attempt at the same record is to go on. ``tolerance``: how far parameters, and forces over a
+    site's largest, may be apart, relative.
+
     Returns ``same``, ``tolerance``, ``parameters`` and ``forces`` (largest relative difference by name), and
     ``versions`` that differ, each as (then, now). Raises `InputError` where the record is not one, or the
     study's inputs or settings are no longer those of the record.
-
-    Parameters
-    ----------
-    record : ``results/run.json`` of a study, or the study.
-    folder : the new one; must not exist, unless an earlier attempt at the same record is to go on.
-    tolerance : how far parameters, and forces over a site's largest, may be apart, relative.
     """
     record, folder = Path(record), Path(folder)
     study = load_study(record.absolute().parent.parent if record.name == RECORD else record)
@@ -80,9 +78,8 @@ def _read(file: Path) -> dict[str, Any]:
     if not isinstance(known, dict) or not {"settings", "inputs", "versions", "stages"} <= set(known):
         raise InputError("is not the record of a run", file=file, remedy="give results/run.json of a study")
     if not {"calibrate", "predict"} <= set(known["stages"]):
-        raise InputError(
-            "that run did not reach its predictions", file=file, remedy="run the study to its end"
-        )
+        what = "that run did not reach its predictions"
+        raise InputError(what, file=file, remedy="run the study to its end")
     return known
 
 
@@ -98,11 +95,8 @@ def _check_unchanged(study: Study, known: Mapping[str, Any], file: Path) -> None
             if table not in ("execution", "acquire") and known["settings"].get(table) != now.get(table)
         ]
     if changed:
-        raise InputError(
-            f"the study has changed since: {', '.join(changed[:4])}",
-            file=file,
-            remedy="bring back what it was made from, or run the study again for a new record",
-        )
+        remedy = "bring back what it was made from, or run the study again for a new record"
+        raise InputError(f"the study has changed since: {', '.join(changed[:4])}", file=file, remedy=remedy)
 
 
 def _copy_inputs(study: Study, folder: Path) -> None:
@@ -119,9 +113,8 @@ def _copy_inputs(study: Study, folder: Path) -> None:
         if path.is_absolute():
             continue
         if not source.resolve().is_relative_to(root) or ".." in path.parts:
-            raise InputError(
-                f"{path} lies outside the study's folder", file=study.file, remedy="name it by its full path"
-            )
+            what = f"{path} lies outside the study's folder"
+            raise InputError(what, file=study.file, remedy="name it by its full path")
         target = folder / ("study.toml" if path == Path(study.file.name) else path)
         target.parent.mkdir(parents=True, exist_ok=True)
         if source.is_dir():

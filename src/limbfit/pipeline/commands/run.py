@@ -252,16 +252,10 @@ def run_batch(
 ) -> Iterator[dict[str, Any]]:
     """Run studies one after the other on the same workers; a study that fails does not stop the others.
 
-    Raises `InputError` for a stage that there is not.
-
-    Yields for each study as it ends: ``study`` (its path as given), ``state`` (``done`` or ``failed``),
-    ``seconds``, ``error`` (one line, where it failed), and its mean errors and report.
-
-    Parameters
-    ----------
-    paths : of studies, each a ``study.toml`` or its folder.
-    until : name of the last stage to do; default all.
-    workers : how many simulate side by side; 0: one per core.
+    ``paths``: of studies, each a ``study.toml`` or its folder. ``until``: name of the last stage to do;
+    default all. ``workers``: how many simulate side by side; 0: one per core. Yields for each study as it
+    ends: ``study`` (its path as given), ``state`` (``done`` or ``failed``), ``seconds``, ``error`` (one line,
+    where it failed), and its mean errors and report. Raises `InputError` for a stage that there is not.
     """
     if until is not None and until not in STAGE_NAMES:
         raise InputError(f"no stage is named {until!r}", remedy="stages are " + ", ".join(STAGE_NAMES))
@@ -286,13 +280,10 @@ def run_experiment(
 ) -> dict[str, Any]:
     """Do an experiment of a study, and before it every stage that it needs and that is not done.
 
-    Its results lie in ``results/<name>``; ``limbfit report`` shows them.
-
-    Returns what ``results/<name>/<name>.json`` holds, and ``folder``, where that is. Raises `InputError` for
-    an experiment or option that there is not, or an input that cannot be used; and `RunError` when another
-    run holds the study, or the disk is full.
-
-    ``name``: of the experiment. ``options``: as the experiment takes them; left out: its defaults.
+    ``name``: of the experiment. ``options``: as the experiment takes them; left out: its defaults. Returns
+    what ``results/<name>/<name>.json`` holds, and ``folder``, where that is; ``limbfit report`` shows it.
+    Raises `InputError` for an experiment or option that there is not, or an input that cannot be used; and
+    `RunError` when another run holds the study, or the disk is full.
     """
     experiment = EXPERIMENTS[name]
     if name in _FOLDERS:

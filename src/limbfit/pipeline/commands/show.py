@@ -29,11 +29,8 @@ def show_stage(study: Study, stage: str, *, listener: Listener = ignore_progress
     if stage not in SHOWN:
         raise InputError(f"no stage {stage!r} can be shown", remedy="stages are " + ", ".join(SHOWN))
     if stage == "segment" and study.image is None:
-        raise InputError(
-            "the study has surfaces and no image, so there is nothing to segment",
-            file=study.file,
-            remedy="see its surfaces with: limbfit surfaces",
-        )
+        what = "the study has surfaces and no image, so there is nothing to segment"
+        raise InputError(what, file=study.file, remedy="see its surfaces with: limbfit surfaces")
     run_study(study, until=stage, listener=listener)
     store = Store(study.results)
     if stage == "segment":

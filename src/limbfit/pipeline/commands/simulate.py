@@ -56,10 +56,7 @@ class PreparedIndentation:
 def prepare_site(
     study: Study, name: str, *, parameters: Parameters | None = None, listener: Listener = ignore_progress
 ) -> PreparedIndentation:
-    """A site as recorded, or as the study plans it; meshes are made where missing.
-
-    Raises `InputError` for a site that the study does not have, identified parameters that are stale, or any
-    input of the stages before.
+    """A site as recorded, or as the study plans it; meshes are made where missing. Errors as `simulate_site`.
 
     ``name``: of a site with one record at most, or of a record. ``parameters``: per tissue; by default the
     identified ones, or the study's start where none were identified.
@@ -81,18 +78,12 @@ def simulate_site(
     solver: str | None = None,
     listener: Listener = ignore_progress,
 ) -> dict[str, Any]:
-    """Simulate one indentation (see `prepare_site`).
+    """Simulate one indentation; curve and fields at the deepest point go to ``results/simulate``.
 
-    Curve and fields at the deepest point go to ``results/simulate``.
-
-    Raises `InputError` for a site that the study does not have, identified parameters that are stale, or any
-    input of the stages before.
-
-    Parameters
-    ----------
-    parameters : as `prepare_site`.
-    animation : also the fields of every step, as a PVD collection.
-    solver : ``limbfit`` or ``febio``; by default what the study says.  FEBio's fields stay in its own file.
+    ``name``, ``parameters``: as `prepare_site`. ``animation``: also the fields of every step, as a PVD
+    collection. ``solver``: ``limbfit`` or ``febio``, by default what the study says; FEBio's fields stay in
+    its own file. Raises `InputError` for a site that the study does not have, identified parameters that are
+    stale, or any input of the stages before.
     """
     by_febio = (solver or study.solver.solver) == "febio"
     program = find_febio(study.febio.program, study.folder) if by_febio else None
@@ -145,11 +136,9 @@ def write_site_curve(model: SiteModel, result: Result, file: Path) -> None:
     times = model.curve_times(CURVE_POINTS)
     if not result.completed:
         times = times[times + model.waits_s <= result.times[-1]]
+    own = times + model.waits_s  # of the simulation
     write_curves(
-        file,
-        time_s=times,
-        displacement_mm=result.displacement_at(times + model.waits_s),
-        force_N=result.force_at(times + model.waits_s),
+        file, time_s=times, displacement_mm=result.displacement_at(own), force_N=result.force_at(own)
     )
 
 
@@ -211,11 +200,9 @@ def choose_parameters(study: Study, given: Parameters | None = None) -> tuple[Pa
         start = {tissue: study.material.get(tissue, "start") for tissue in study.tissues}
         return start, "start of the study"
     if not is_done(study, "calibrate"):
-        raise InputError(
-            "the identified parameters are stale: made from other inputs, settings or code",
-            file=store["calibrate"] / "calibration.json",
-            remedy="identify again (limbfit run), or give --parameters",
-        )
+        what = "the identified parameters are stale: made from other inputs, settings or code"
+        remedy = "identify again (limbfit run), or give --parameters"
+        raise InputError(what, file=store["calibrate"] / "calibration.json", remedy=remedy)
     return store.results.calibration.parameters, IDENTIFIED
 
 

@@ -23,12 +23,8 @@ def watch_records(
     """Judge every record in a folder and below it, and each that comes or changes, as soon as it rests.
 
     Without a ``study``, columns have limbfit's own names. What a study names beside a record's force
-    (ultrasound, surface, shear waves) and hidden files are passed over. Raises `InputError` where there is no
-    such folder.
-
-    Parameters
-    ----------
-    once : judge what is there, whether it rests or not, and end.
+    (ultrasound, surface, shear waves) and hidden files are passed over. ``once``: judge what is there,
+    whether it rests or not, and end. Raises `InputError` where there is no such folder.
     """
     place = Path(folder)
     if not place.is_dir():

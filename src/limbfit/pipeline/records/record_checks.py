@@ -19,7 +19,7 @@ from ...identify.fit.objective import SiteResponse
 from ...indentation import SimulationJob, compute_contact_radius
 from ...results.base import read_curves
 from ...results.limb import PlacedSite, RecordFlag, TraceFacts
-from ...study import Record, Study
+from ...study import Study
 from ...traces import SurfaceMotion
 from ..engine.context import Context
 from ..engine.store import Store
@@ -50,62 +50,39 @@ def record_flags(
     placed: Mapping[str, PlacedSite],
     anatomy: Anatomy | None,
 ) -> tuple[RecordWarning, ...]:
-    """Flags on the records.
+    """Flags on the ``records``, of each of which ``traces.json`` says this.
 
-    Parameters
-    ----------
-    records : what ``traces.json`` says of each.
-    steps_s : time between samples of each.
-    placed : what ``sites.json`` says of the sites whose place is known (yet).
-    anatomy : None while the surfaces are not known.
+    ``steps_s``: time between samples of each. ``placed``: what ``sites.json`` says of the sites whose place
+    is known (yet). ``anatomy``: None while the surfaces are not known.
     """
-    recorded = [record for record in study.recorded if record.name in records]
-    facts = [
-        _collect_facts(
-            one,
-            records[one.name],
-            steps_s[one.name],
-            compute_contact_radius(study.indenter_of(one)),
-            placed.get(one.site.name),
-            anatomy,
+    recorded, facts = [record for record in study.recorded if record.name in records], list[RecordFacts]()
+    for one in recorded:
+        record, row = records[one.name], placed.get(one.site.name)
+        radius, of_place = compute_contact_radius(study.indenter_of(one)), dict[str, Any]()
+        if row is not None and anatomy is not None:
+            width = radius * np.sqrt(np.pi)
+            normal = compute_indenter_axis(anatomy.open_skin, row.position_mm, width, one.site.edge)
+            of_place = {
+                "position_mm": row.position_mm,
+                "thickness_mm": measure_tissue_under(anatomy, row.position_mm, normal, width),
+                "axis_deg": float(np.degrees(np.arccos(np.clip(np.array(row.axis) @ normal, -1, 1)))),
+                "off_skin_mm": row.off_skin_mm if row.marker is None else None,
+                "hint_mm": None if row.marker is None else row.marker.distance_to_hint_mm,
+            }
+        own = RecordFacts(
+            record=one.name,
+            site=one.site.name,
+            peak_N=record.peak_force_N,
+            depth_mm=record.depth_mm,
+            speed_mm_s=abs(record.speed_load_mm_s),
+            step_s=steps_s[one.name],
+            radius_mm=radius,
+            **of_place,
         )
-        for one in recorded
-    ]
+        facts.append(own)
     remarks = [(one.name, remark) for one in recorded for remark in records[one.name].remarks]
     of_reading = (RecordWarning((name,), **remark.to_plain()) for name, remark in remarks)
     return (*of_reading, *check_plausibility(facts))
-
-
-def _collect_facts(
-    stated: Record,
-    record: TraceFacts,
-    step_s: float,
-    radius: float,
-    row: PlacedSite | None,
-    anatomy: Anatomy | None,
-) -> RecordFacts:
-    facts: dict[str, Any] = {}
-    if row is not None and anatomy is not None:
-        width = radius * np.sqrt(np.pi)
-        axis = np.array(row.axis)
-        normal = compute_indenter_axis(anatomy.open_skin, row.position_mm, width, stated.site.edge)
-        facts = {
-            "position_mm": row.position_mm,
-            "thickness_mm": measure_tissue_under(anatomy, row.position_mm, normal, width),
-            "axis_deg": float(np.degrees(np.arccos(np.clip(axis @ normal, -1, 1)))),
-            "off_skin_mm": row.off_skin_mm if row.marker is None else None,
-            "hint_mm": None if row.marker is None else row.marker.distance_to_hint_mm,
-        }
-    return RecordFacts(
-        record=stated.name,
-        site=stated.site.name,
-        peak_N=record.peak_force_N,
-        depth_mm=record.depth_mm,
-        speed_mm_s=abs(record.speed_load_mm_s),
-        step_s=step_s,
-        radius_mm=radius,
-        **facts,
-    )
 
 
 def choose_surface_points(

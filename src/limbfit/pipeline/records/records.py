@@ -240,14 +240,12 @@ def build_model(context: Context, one: Indentation) -> SiteModel:
 
 def estimate_surface_error_mm(study: Study, store: Store) -> float:
     """Standard deviation of where the study's surfaces are: as stated, by the voxels, or of files."""
-    stated = study.calibration.surface_error_mm
-    labels = store["segment"] / "labels.seg.nrrd"
-    if stated is not None:
-        return stated
+    if study.calibration.surface_error_mm is not None:
+        return study.calibration.surface_error_mm
     if study.image is None:  # labels may be there of one that it had before
         return GIVEN_MM
     reader = sitk.ImageFileReader()
-    reader.SetFileName(str(labels))
+    reader.SetFileName(str(store["segment"] / "labels.seg.nrrd"))
     reader.ReadImageInformation()
     return OF_A_VOXEL * float(np.prod(reader.GetSpacing()[:3])) ** (1 / 3)
 
@@ -284,16 +282,8 @@ def _estimate_curve_noise(study: Study, record: SiteRecord, force_N: Array) -> S
         parts = [pressed & (since >= phase.start_s) & (since <= phase.end_s) for phase in smooth.phases]
         found = estimate_noise(*(trace.force_N[part] for part in parts))
         scatter = found.sd_N, found.lag
-    return estimate_record_noise(
-        record.name,
-        record.times_s,
-        residual,
-        force_N,
-        None if record.record.forced else record.displacement_mm,
-        record.touch_down_sd_mm,
-        record.smoothing,
-        scatter,
-    )
+    curves = record.times_s, residual, force_N, None if record.record.forced else record.displacement_mm
+    return estimate_record_noise(record.name, *curves, record.touch_down_sd_mm, record.smoothing, scatter)
 
 
 def estimate_site_deviation(
@@ -323,10 +313,8 @@ def compute_expected_share(model: SiteModel, surface_mm: float) -> float:
 
 def compute_thickness_slope(radius_mm: float, thickness_mm: float) -> float:
     """``-d log F / d log h`` of a flat punch on a bonded layer."""
-    ratio = radius_mm / thickness_mm
-    return float(
-        np.log(compute_layer_factor(ratio * _STEP) / compute_layer_factor(ratio / _STEP)) / np.log(_STEP**2)
-    )
+    above, below = (compute_layer_factor(radius_mm / thickness_mm * step) for step in (_STEP, 1.0 / _STEP))
+    return float(np.log(above / below) / np.log(_STEP**2))
 
 
 def measure_bone_distance_mm(model: SiteModel) -> float | None:

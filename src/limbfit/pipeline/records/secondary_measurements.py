@@ -189,18 +189,14 @@ def read_secondary_values(
 ) -> tuple[SecondaryValues, ...]:
     """What is compared beside a stored record, in the order of a simulation's gauges.
 
-    Parameters
-    ----------
-    folder : of the stage ``traces``, which has stored the record's ``facts``.
-    points : those of its surface that are compared; None: none.
-    times_s : (t,) of the record.
+    ``folder``: of the stage ``traces``, which has stored the record's ``facts``. ``points``: those of its
+    surface that are compared; None: none. ``times_s``: (t,) of the record.
     """
     tissues, found = list_compared_tissues(facts), list[SecondaryValues]()
     if tissues:
         layers = read_curves(folder / LAYERS.format(record.name))
         for number, tissue in enumerate(tissues):
-            stated = facts.layers[tissue]
-            found.append(_build_layer_measurement(tissue, stated, layers, number, times_s))
+            found.append(_build_layer_measurement(tissue, facts.layers[tissue], layers, number, times_s))
     first = len(found)
     if points is not None:
         motion = read_motion(folder, record)
@@ -222,25 +218,13 @@ def list_compared_tissues(facts: TraceFacts) -> list[str]:
 def _build_layer_measurement(
     tissue: str, stated: LayerRecord, curves: dict[str, Array], number: int, times_s: Array
 ) -> LayerMeasurement:
+    time_s, values, samples = (curves[name] for name in ("time_s", f"{tissue}_mm", "samples"))
     thinning = LayerThinning(
-        tissue,
-        stated.thickness_mm,
-        curves["time_s"],
-        curves[f"{tissue}_mm"],
-        curves["samples"],
-        stated.before,
-        stated.sd_mm,
+        tissue, stated.thickness_mm, time_s, values, samples, stated.before, stated.sd_mm
     )
-    n = len(thinning.time_s)
-    return LayerMeasurement(
-        tissue,
-        thinning.compression_mm,
-        thinning.time_s,
-        np.full(n, number),
-        build_linear_interpolation(thinning.time_s, times_s),
-        thinning.covariance,
-        {"sd": stated.sd_mm, "thickness_mm": stated.thickness_mm, "compared": f"{n} times"},
-    )
+    facts = {"sd": stated.sd_mm, "thickness_mm": stated.thickness_mm, "compared": f"{len(time_s)} times"}
+    gauge, at = np.full(len(time_s), number), build_linear_interpolation(time_s, times_s)
+    return LayerMeasurement(tissue, values, time_s, gauge, at, thinning.covariance, facts)
 
 
 def _build_surface_measurement(
@@ -256,16 +240,11 @@ def _build_surface_measurement(
         "components": list(words),
         "compared": f"{len(points.points)} points, {len(means.moved_mm)} values",
     }
+    gauge = first + 3 * means.point + means.component
+    at = means.frames @ build_linear_interpolation(motion.time_s, times_s)
+    values = means.moved_mm, means.time_s, gauge, at, np.diag(sd**2 / means.samples)
     return SurfaceMeasurement(
-        "surface",
-        means.moved_mm,
-        means.time_s,
-        first + 3 * means.point + means.component,
-        means.frames @ build_linear_interpolation(motion.time_s, times_s),
-        np.diag(sd**2 / means.samples),
-        facts,
-        np.array(points.points)[means.point],
-        means.component,
+        "surface", *values, facts, np.array(points.points)[means.point], means.component
     )
 
 
@@ -274,15 +253,10 @@ def _build_wave_measurement(
 ) -> WaveMeasurement:
     means, n = WaveMeans(curves["time_s"], curves["speed_m_s"], curves["samples"]), len(curves["time_s"])
     sd, bias = record.shear_waves_sd_m_s, record.shear_waves_bias_m_s
-    return WaveMeasurement(
-        f"{name}-waves",
-        means.speed_m_s,
-        means.time_s,
-        np.full(n, gauge),
-        build_linear_interpolation(means.time_s, times_s),
-        means.covariance(sd, bias),
-        {"sd": sd, "bias": bias, "compared": f"{n} times"},
-    )
+    facts = {"sd": sd, "bias": bias, "compared": f"{n} times"}
+    gauges, at = np.full(n, gauge), build_linear_interpolation(means.time_s, times_s)
+    values = means.speed_m_s, means.time_s, gauges, at, means.covariance(sd, bias)
+    return WaveMeasurement(f"{name}-waves", *values, facts)
 
 
 @dataclass(frozen=True)
@@ -328,13 +302,9 @@ def choose_points(
 ) -> ChosenPoints:
     """The points of a record's surface that can be compared, at most `MAX_POINTS`, evenly spread.
 
-    Raises `TraceError` where there is none, with the study's file.
-
-    Parameters
-    ----------
-    place : position and axis of the indenter.
-    skin : points (n, 3) mm and faces (f, 3 or more).
-    motion : in the frame that the study states.
+    ``place``: position and axis of the indenter. ``skin``: points (n, 3) mm and faces (f, 3 or more).
+    ``motion``: in the frame that the study states. Raises `TraceError` where there is none, with the study's
+    file.
     """
     assert record.surface is not None
     file = study.path(record.surface)
@@ -352,10 +322,8 @@ def choose_points(
 
     away = np.linalg.norm(points - place[0], axis=1)
     if away.min() > NEAR_MM:
-        raise build_error(
-            f"no point lies within {NEAR_MM:g} mm of site {record.site.name}: the nearest is "
-            f"{away.min():.0f} mm away"
-        )
+        what = f"no point lies within {NEAR_MM:g} mm of site {record.site.name}"
+        raise build_error(f"{what}: the nearest is {away.min():.0f} mm away")
     found = find_nearest_points(*skin, points)
     reasons = {
         f"farther than {NEAR_MM:g} mm from the site": away > NEAR_MM,
@@ -401,6 +369,5 @@ def place_waves(
     try:
         return place_waves_under(model, read_vtu(model.mesh), [(one.tissue, one.depth_mm) for one in waves])
     except ProblemError as error:
-        file = study.path(record.shear_waves)
-        what = f"site {record.site.name}: {error.what}"
+        what, file = f"site {record.site.name}: {error.what}", study.path(record.shear_waves)
         raise TraceError(what, file=file, place="header", remedy=error.remedy) from None

@@ -65,14 +65,12 @@ def build_undeformed_socket(
             shape.load_of(study, load, anatomy, plain)
         regions, middles = shape.build_regions(study, anatomy), outer.triangles.mean(axis=1)
         covered = shape.find_covered_regions(middles, anatomy.skin, regions, plain)
-        shape.check_regions(
-            study, [one.region for one in study.socket.design.regions], f"{PLACE}.regions", covered
-        )
+        stated = [one.region for one in study.socket.design.regions]
+        shape.check_regions(study, stated, f"{PLACE}.regions", covered)
         shape.check_regions(study, optimise, "--optimise", covered)
         if not shape.build_target(study).at(middles, anatomy, regions, plain).any():
-            raise SurfaceError(
-                "no pressure is stated anywhere on the limb", remedy="state one below the brim"
-            )
+            what = "no pressure is stated anywhere on the limb"
+            raise SurfaceError(what, remedy="state one below the brim")
         shape.build_socket_wall(study, anatomy, plain)
     return recipe, plain
 
@@ -176,14 +174,11 @@ def _compute_pressed_recipe(unloaded: SocketRun, plain: Recipe, target: Target, 
     end = problem.history.times[-1]
 
     def make() -> Made:
-        result = press_limb(
-            problem, lambda step: tell(step.time / end, f"target pressure: {step.time:.2f} of {end:g} s")
-        )
+        words = "target pressure: {:.2f} of {:g} s"
+        result = press_limb(problem, lambda step: tell(step.time / end, words.format(step.time, end)))
         if not result.completed:
-            raise RunError(
-                f"the limb could not be put under the target pressure: {result.reason}; lower "
-                f"{PLACE}.pressure_kPa, or choose another socket.edge_mm"
-            )
+            what = f"the limb could not be put under the target pressure: {result.reason}"
+            raise RunError(f"{what}; lower {PLACE}.pressure_kPa, or choose another socket.edge_mm")
         return {"statistics": result.statistics}, {"displacement": result.states[-1].u}
 
     given = unloaded.key, code_digest(press_limb), pressure.tolist()

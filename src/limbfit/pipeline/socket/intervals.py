@@ -82,14 +82,10 @@ class SimulationSpread:
         own = [(tissue, parameter.name) for tissue in study.tissues for parameter in study.law.parameters]
         simulated = np.array([name in names for name in own])  # fibres that a tissue has not change nothing
         order = [list(names).index(name) for name in own if name in names]
-        tissue_keys, liner_keys = (
-            {parameter.name: parameter.key for parameter in law.parameters}
-            for law in (study.law, LAWS[OGDEN])
-        )
-        keyed = [
-            f"{region}.{(tissue_keys if region in study.tissues else liner_keys)[name]}"
-            for region, name in names
-        ]
+        keyed = []
+        for region, name in names:
+            law = study.law if region in study.tissues else LAWS[OGDEN]  # a liner's
+            keyed += [f"{region}.{parameter.key}" for parameter in law.parameters if parameter.name == name]
         return cls(keyed, order, known.select(simulated))
 
     def propagate(
@@ -175,9 +171,8 @@ def widen_intervals(
 
 def store_change(facts: Mapping[str, Any], other: Mapping[str, Any], of: str) -> None:
     """Store how every value with an interval changes to that of ``other`` facts, beside its other changes."""
-    for (row, key, name, unit), (there, *_) in zip(
-        _iterate_values(facts), _iterate_values(other), strict=True
-    ):
+    pairs = zip(_iterate_values(facts), _iterate_values(other), strict=True)
+    for (row, key, name, unit), (there, *_) in pairs:
         row[f"{name}change_{unit}"][of] = there[key] - row[key]
 
 

@@ -119,18 +119,11 @@ def build_regions(study: Study, anatomy: Anatomy) -> dict[str, SkinRegion]:
 
 
 def check_regions(study: Study, names: Sequence[str], place: str, known: Collection[str]) -> None:
-    """That regions which are named are among the ``known`` ones.
-
-    Raises `StudyError` with those that there are.
-    """
+    """Raise `StudyError` for a region that is named and not among the ``known`` ones, with those."""
     wrong = next((name for name in names if name not in known), None)
     if wrong is not None:
-        raise StudyError(
-            f"no region is named {wrong!r}",
-            file=study.file,
-            place=place,
-            remedy="there are " + ", ".join(known),
-        )
+        what, remedy = f"no region is named {wrong!r}", f"there are {', '.join(known)}"
+        raise StudyError(what, file=study.file, place=place, remedy=remedy)
 
 
 def load_of(
@@ -163,19 +156,13 @@ def check_load(study: Study, load: SocketLoadTable, bones: Collection[str], is_c
     named = [any(bone in name.lower() for name in bones) for bone in ("tibia", "fibula")]
     if (standard.ahead_mm or standard.inside_mm) and load.point is None and (is_cut or not named[0]):
         why = "the proximal cut goes through the tibia" if named[0] else "no bone is named tibia"
-        raise StudyError(
-            f"{load.preset!r} passes beside the knee centre, which is not known: {why}",
-            file=study.file,
-            place=place,
-            remedy='state point, beside which it passes (LPS, mm), or force_N, or take "single stance"',
-        )
+        what = f"{load.preset!r} passes beside the knee centre, which is not known: {why}"
+        remedy = 'state point, beside which it passes (LPS, mm), or force_N, or take "single stance"'
+        raise StudyError(what, file=study.file, place=place, remedy=remedy)
     if (standard.medial or standard.inside_mm) and study.socket.side is None and not all(named):
-        raise StudyError(
-            "medial and lateral are not known: no bones are named tibia and fibula",
-            file=study.file,
-            place=place,
-            remedy='state socket.side ("left" or "right")',
-        )
+        what = "medial and lateral are not known: no bones are named tibia and fibula"
+        remedy = 'state socket.side ("left" or "right")'
+        raise StudyError(what, file=study.file, place=place, remedy=remedy)
 
 
 def check_tissues(study: Study) -> None:
@@ -192,10 +179,7 @@ def check_tissues(study: Study) -> None:
 
 
 def build_loadable_socket(study: Study, anatomy: Anatomy, outer: Surface) -> Socket:
-    """`build_socket` a limb on which the study's loads are known, too.
-
-    Raises `StudyError` with the key and the remedy.
-    """
+    """`build_socket` a limb on which the study's loads are known, too; errors likewise."""
     socket = build_socket(study, anatomy, outer)
     for load in study.socket.loads:
         load_of(study, load, anatomy, socket)

@@ -79,7 +79,11 @@ def run_socket(
     known = None
     if covariance_log is not None:
         off = np.log(study.vector(most_probable or parameters) / study.vector(parameters))
-        known = _build_spread(np.array(covariance_log), off, relaxation, study.socket.worn_s)
+        known = ParameterSpread(np.array(covariance_log), off)
+        if relaxation is not None:
+            spread = RelaxationSpread.from_stored(RelaxationBeyond.model_validate(relaxation))
+            own, worn = spread.own_weight, spread.interpolate(study.socket.worn_s)
+            known = ParameterSpread(own * known.covariance, own * off, *worn)
     content = summarise_run(run, found, known)
     compared = _compare_with_records(run, found, recorded_range)
     for held in (content["donning"], *content["loads"]):
@@ -112,17 +116,6 @@ def run_socket(
         write_vtu(mesh, folder / f"held-{i}.vtu", point_data=fields, cell_data=one.strains.fields)
     _write_tables(folder, result)
     kept.drop(run.partial_key)
-
-
-def _build_spread(
-    covariance: Array, off: Array, relaxation: Mapping[str, Any] | None, worn_s: float
-) -> ParameterSpread:
-    """How well parameters are known, as `ParameterSpread` has it, once the socket has been worn so long."""
-    if relaxation is None:
-        return ParameterSpread(covariance, off)
-    spread = RelaxationSpread.from_stored(RelaxationBeyond.model_validate(relaxation))
-    own = spread.own_weight
-    return ParameterSpread(own * covariance, own * off, *spread.interpolate(worn_s))
 
 
 def _describe_shape(run: SocketRun) -> SocketShape:
@@ -199,17 +192,11 @@ def _simulate_samples(
 
 def _write_tables(folder: Path, result: SocketResult) -> None:
     columns = ("mean_kPa", "peak_kPa", "shear_kPa", "shear_peak_kPa")
-    rows = [
-        [
-            name,
-            region.region,
-            *(getattr(region, key) for key in columns),
-            *(region.interval_kPa or ("", "")),
-            next(iter(region.interval_from or {}), ""),
-        ]
-        for name, held in result.states.items()
-        for region in held.regions
-    ]
+    rows = list[list[Any]]()
+    for name, held in result.states.items():
+        for region in held.regions:
+            values, interval = (getattr(region, key) for key in columns), region.interval_kPa or ("", "")
+            rows.append([name, region.region, *values, *interval, next(iter(region.interval_from or {}), "")])
     heads = ["load", "region", *columns, "low_kPa", "high_kPa", "mostly_from"]
     write_table(folder / "regions.csv", heads, rows)
     keys = ("time_s", "peak_kPa", "mean_kPa", "contact_area_mm2", "imbalance_percent")
