@@ -127,7 +127,13 @@ HAZARDS = {
 }
 
 
-@pytest.mark.parametrize("name", HAZARDS)
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=[pytest.mark.slow] * (name in ("late samples", "lost link to the sensor")))
+        for name in HAZARDS
+    ],
+)
 def test_each_hazard_ends_the_session_before_the_force_is_over_its_limit(
     name: str, planned: Path, start: Start
 ) -> None:

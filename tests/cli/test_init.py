@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 from limbfit import load_study
@@ -40,20 +41,19 @@ def test_a_place_that_is_none_is_asked_for_again(study: Path) -> None:
     assert load_study(study).site("1").position == (40.0, 0.0, 60.0)
 
 
-def test_without_records_the_way_to_sites_is_said_and_nothing_runs_beyond_surfaces(study: Path) -> None:
+def test_without_records_the_way_to_sites_is_said_and_nothing_runs_beyond_surfaces(
+    study: Path, limbfit: Callable[..., tuple[int, str, str]]
+) -> None:
     (study / "study.toml").unlink()
     done = ask(study, "stump", "1", "tibia", "mm", "square", "20", "n", "n")
     assert "it has no site yet" in done.stdout
-    command = [sys.executable, "-m", "limbfit"]
     for words in (("run",), ("simulate", "--site", "1"), ("uncertainty",), ("design", "--sites", "2")):
-        refused = subprocess.run(
-            [*command, words[0], str(study), *words[1:]], capture_output=True, text=True, check=False
-        )
-        assert refused.returncode == 2, refused.stdout
-        assert "the study has no site yet; add [[sites]], or place sites in limbfit studio" in refused.stderr
-    checked = subprocess.run([*command, "check", str(study)], capture_output=True, text=True, check=False)
-    assert checked.returncode == 0, checked.stderr
-    assert "the study has no site yet" in checked.stdout
+        code, _, error = limbfit(words[0], study, *words[1:])
+        assert code == 2
+        assert "the study has no site yet; add [[sites]], or place sites in limbfit studio" in error
+    code, shown, _ = limbfit("check", study)
+    assert code == 0
+    assert "the study has no site yet" in shown
 
 
 def test_a_folder_that_has_a_study_is_left_alone(study: Path) -> None:

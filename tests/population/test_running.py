@@ -114,6 +114,7 @@ def test_a_rule_is_made_robust_and_checked_on_fresh_people(tmp_path):
     assert found["checked_people"] == 2
 
 
+@pytest.mark.slow
 def test_a_rule_that_fits_no_limb_is_refused_in_one_line(tmp_path):
     area = '[rules.socket]\nareas = [{ name = "a", region = "shin", radius_mm = 20.0, depth_mm = 3.0 }]\n'
     folder = make(tmp_path / "trial", TRIAL.replace("[[limits]]\n", area + "[[limits]]\n"))

@@ -119,6 +119,7 @@ def test_bodies_that_cannot_be_told_apart_are_refused():
         name_bodies(limb, "limb.stl")
 
 
+@pytest.mark.slow
 def test_limbs_with_other_triangles_are_registered(tmp_path):
     for i, (long, wide, fine) in enumerate([(0, 0, 24), (20, 3, 30)]):
         write_surface(tmp_path / f"{i}.stl", make_limb(long, wide, fine))

@@ -79,7 +79,8 @@ def remove_table(file: Path, place: str, name: str) -> None:
         rows: Any = document
         for key in place.split("."):
             rows = rows.get(key, {})
-        rows.remove(_find(rows, name, file, place))
+        found = _find(rows, name, file, place)
+        rows.remove(found)
 
 
 def set_area(file: Path, name: str, values: Mapping[str, Any]) -> None:

@@ -126,6 +126,7 @@ def over(tmp_path_factory) -> SiteModel:
     return replace(model, steps=SolverTable(load_steps=3, unload_steps=2))
 
 
+@pytest.mark.slow
 def test_a_site_over_it_feels_it_with_exact_derivatives(over: SiteModel) -> None:
     times = tuple(np.linspace(0.0, over.knots_s[-1], 13))
 
