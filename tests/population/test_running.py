@@ -52,6 +52,7 @@ def read(folder):
     return table.sort_values(list(COLUMNS[:-1]), ignore_index=True)
 
 
+@pytest.mark.slow
 def test_a_person_wears_a_socket_and_can_be_opened(tmp_path):
     folder = make(tmp_path / "trial")
     with place_jobs(Placement(workers=1)):

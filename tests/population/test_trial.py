@@ -107,6 +107,7 @@ def test_a_key_that_no_study_has_is_named(tmp_path):
         people.write_study(people.draw(1), people.trial.rules[0], limb, tmp_path / "one" / "a")
 
 
+@pytest.mark.slow
 def test_a_limb_whose_bone_comes_too_near_to_the_skin_is_refused(tmp_path):
     load(tmp_path, PHANTOM + "least_tissue_mm = 15.0\n")
     with pytest.raises(InputError, match=r"none of the first 3 people can be simulated.*to the skin"):
