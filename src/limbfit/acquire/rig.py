@@ -184,7 +184,7 @@ class Rig:
     def send(self, command: wire.Command, now: float) -> None:
         """See `Device.send`; ``now`` is not used: what is sent is sent at once."""
         match command:
-            case wire.Move(target_um=target) if self._stopped:
+            case wire.Move() if self._stopped:
                 self._notices.append(wire.Rejection(0, "stopped"))
             case wire.Move(target_um=target) if target > self._fence_um:
                 self._notices.append(wire.Rejection(0, "position"))
@@ -206,8 +206,8 @@ class Rig:
         self._due_s = max(self._due_s + 1 / self.table.rate_hz, now)
         try:
             self._force_mN = round(1000 * self.measure_force())
-        except RunError as error:
-            self._trip("sensor", str(error))
+        except RunError:
+            self._trip("sensor")
         asked = time.monotonic()
         position_um = round(1000 * self.measure_position())
         now = (asked + time.monotonic()) / 2
@@ -229,17 +229,22 @@ class Rig:
         self._sensor.close()
 
     def _make_sample(self, now: float) -> Sample:
-        is_moving = self._move is not None
-        flags = Flags(0)
+        move, flags = self._move, Flags(0)
         if self._stopped:
             flags |= Flags.STOPPED
-        if self._is_home() and not (is_moving and self._move and self._move.target_um > HOME_UM):
+        if self._is_home() and (move is None or move.target_um <= HOME_UM):
             flags |= Flags.HOME
         if self._given_up:
             flags |= Flags.GIVEN_UP
         time_us = round(1e6 * (now - self._start_s)) + 1
         return Sample(
-            self._number, time_us, int(flags), int(is_moving), (self._position_um,), (self._force_mN,), (0,)
+            self._number,
+            time_us,
+            int(flags),
+            int(move is not None),
+            (self._position_um,),
+            (self._force_mN,),
+            (0,),
         )
 
     def _is_home(self) -> bool:
@@ -260,7 +265,7 @@ class Rig:
         elif now - self._moved_s > STUCK_S and self._stopped:
             self._given_up = True
         elif now - self._moved_s > STUCK_S:
-            self._trip("stuck", "the stage does not move")
+            self._trip("stuck")
 
     def _advance(self) -> None:
         """Send the stage on: towards the limb by a short way, away from it the whole."""
@@ -296,7 +301,7 @@ class Rig:
             self._command_move(0, RETRACT_UM_S)
             self._move = wire.Move(1, 0, RETRACT_UM_S)
 
-    def _trip(self, code: str, reason: str) -> None:
+    def _trip(self, code: str) -> None:
         if not self._stopped:
             self._notices.append(wire.LimitTrip(code, 1))
             self._withdraw()

@@ -31,6 +31,7 @@ CLOCK_DRIFT_S = 1e-6  # per sample: two clocks may run apart by 500 ppm without 
 _CODE_MEANINGS = {
     "watchdog": "it heard from limbfit too late: check the wire, and what else runs on this machine",
     "stuck": "a driven pin does not move",
+    "sensor": "its force sensor does not answer in time, or with no number",
     "power": "the actuators have no power",
     "button": "its emergency stop was pressed",
     "force": "over its limit there",

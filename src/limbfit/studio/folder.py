@@ -67,23 +67,21 @@ class StudyFolder:
         return {topic: compute_fingerprint(paths) for topic, paths in files.items()}
 
 
-def resolve_inside(root: Path, *parts: str) -> Path:
-    """The path of a file below ``root``, given by its parts; see `StudyFolder.artefact` for the errors."""
-    check_parts(parts)
-    path = root.joinpath(*parts)
-    if not path.resolve().is_relative_to(root.resolve()):
-        raise InputError(f"the file lies outside of {root.name}")
-    if not path.is_file():
-        raise FileNotFoundError("/".join(parts))
-    return path
+def resolve_inside(root: Path, *parts: str, is_new: bool = False) -> Path:
+    """The path of a file below ``root``, given by its parts; see `StudyFolder.artefact` for the errors.
 
-
-def check_parts(parts: Iterable[str]) -> None:
-    """Refuse a path by its parts where one is no plain name; raises `InputError`."""
+    ``is_new``: it need not be there.
+    """
     for part in parts:
         is_plain = bool(part) and part.isprintable() and not set(part) & set('/\\:*?"<>|')
         if not is_plain or part.startswith("."):
             raise InputError("not the name of a file of the study", remedy="names have no path in them")
+    path = root.joinpath(*parts)
+    if not path.resolve().is_relative_to(root.resolve()):
+        raise InputError(f"the file lies outside of {root.name}")
+    if not is_new and not path.is_file():
+        raise FileNotFoundError("/".join(parts))
+    return path
 
 
 def compute_fingerprint(files: Iterable[Path]) -> str:

@@ -9,7 +9,7 @@ from ..errors import InputError
 from ..pipeline.commands.inputs import list_inputs
 from ..shapes import SHAPES, Stl
 from ..study.writing import NewStudy, create_study
-from .folder import Json, check_parts
+from .folder import Json, resolve_inside
 from .study_routes import Folder
 
 router = APIRouter(prefix="/api/start")
@@ -37,11 +37,7 @@ def post_file(folder: Folder, path: str, content: Content, offset: NonNegativeIn
 
     The same file may come again. Raises `InputError` where another one has its name.
     """
-    parts = path.split("/")
-    check_parts(parts)
-    file = folder.folder.joinpath(INPUTS, *parts)
-    if not file.resolve().is_relative_to(folder.folder.resolve()):
-        raise InputError(f"the file lies outside of {folder.folder.name}")
+    file = resolve_inside(folder.folder, INPUTS, *path.split("/"), is_new=True)
     file.parent.mkdir(parents=True, exist_ok=True)
     file.touch()
     with file.open("r+b") as stream:
