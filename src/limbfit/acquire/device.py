@@ -10,14 +10,19 @@ import secrets
 import select
 import socket
 import time
+import tomllib
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import Any, ClassVar, Protocol
+from pathlib import Path
+from typing import Any, ClassVar, Protocol, TypeVar
+
+from pydantic import BaseModel, ValidationError
 
 from ..errors import InputError, RunError
 from ..extensions import import_extra
 from . import line_protocol as wire
 
+Model = TypeVar("Model", bound=BaseModel)
 DEFAULT_PORT = 7714
 DEFAULT_ADDRESS = f"tcp://127.0.0.1:{DEFAULT_PORT}"
 BAUD = 2_000_000
@@ -296,3 +301,20 @@ def _check_identity(identity: wire.Identity) -> None:
     if (identity.pins, identity.rate_hz) != (wire.PINS, wire.RATE_HZ):
         found = f"{identity.pins} pins at {identity.rate_hz} Hz"
         raise RunError(f"the device has {found}; limbfit knows {wire.PINS} at {wire.RATE_HZ} Hz")
+
+
+def read_model(model: type[Model], file: Path, missing: str, wrong: str) -> Model:
+    """Read the TOML file of a device or of its faults.
+
+    Raises `InputError` with the file, the key and the remedy for a ``missing`` file or a ``wrong`` key.
+    """
+    if not file.is_file():
+        raise InputError("no such file", file=file, remedy=missing)
+    try:  # "-sig": editors on Windows may begin a file with a mark
+        return model.model_validate(tomllib.loads(file.read_text(encoding="utf-8-sig")))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise InputError(f"not valid TOML: {error}", file=file) from None
+    except ValidationError as error:
+        first = error.errors()[0]
+        place = ".".join(str(part) for part in first["loc"]) or None
+        raise InputError(first["msg"], file=file, place=place, remedy=wrong) from None

@@ -9,17 +9,16 @@ host that dies leaves a stage that stops by itself. Away from the limb it is sen
 import json
 import math
 import time
-import tomllib
 from contextlib import suppress
 from hashlib import sha256
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field
 
 from ..errors import InputError, RunError
 from . import line_protocol as wire
-from .device import Link, connect
+from .device import Link, connect, read_model
 from .line_protocol import Flags, Sample
 
 LOOKAHEAD_S = 0.1
@@ -81,18 +80,8 @@ class RigTable(BaseModel):
 
 def read_rig(file: Path) -> RigTable:
     """Read the file of a rig. Raises `InputError` with the key and the remedy."""
-    if not file.is_file():
-        raise InputError(
-            "no such file", file=file, remedy="give the TOML file of a rig (docs/device-protocol.md)"
-        )
-    try:
-        return RigTable.model_validate(tomllib.loads(file.read_text(encoding="utf-8-sig")))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"not valid TOML: {error}", file=file) from None
-    except ValidationError as error:
-        first = error.errors()[0]
-        place = ".".join(str(part) for part in first["loc"]) or None
-        raise InputError(first["msg"], file=file, place=place, remedy="see docs/device-protocol.md") from None
+    page = "docs/device-protocol.md"
+    return read_model(RigTable, file, f"give the TOML file of a rig ({page})", f"see {page}")
 
 
 class Instrument:

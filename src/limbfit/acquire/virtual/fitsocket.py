@@ -6,16 +6,15 @@ what goes out.  Faults come on demand: what goes wrong, when, for how long.
 """
 
 import secrets
-import tomllib
 from collections import deque
 from pathlib import Path
 from typing import Annotated, Literal, get_args
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field
 
-from ...errors import InputError
 from .. import line_protocol as wire
+from ..device import read_model
 from ..line_protocol import PINS, RATE_HZ, Flags, Sample
 from ..safety import FROZEN_S, FROZEN_SAMPLES, Guard, SafetyLimits
 from .parts import STROKE_MM, Motors, Sensors, VirtualLimb
@@ -66,17 +65,8 @@ class _FaultFile(BaseModel):
 
 def read_faults(file: Path) -> tuple[Fault, ...]:
     """Read a TOML file of ``[[faults]]``. Raises `InputError` with the file and the key."""
-    if not file.is_file():
-        raise InputError("no such file", file=file, remedy="give a TOML file with [[faults]]")
-    try:
-        return _FaultFile(**tomllib.loads(file.read_text(encoding="utf-8"))).faults
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise InputError(f"not valid TOML: {error}", file=file) from None
-    except ValidationError as error:
-        first = error.errors()[0]
-        place = ".".join(str(part) for part in first["loc"]) or None
-        remedy = "see docs/acquire.md for the kinds of faults"
-        raise InputError(first["msg"], file=file, place=place, remedy=remedy) from None
+    remedy = "see docs/acquire.md for the kinds of faults"
+    return read_model(_FaultFile, file, "give a TOML file with [[faults]]", remedy).faults
 
 
 class FaultClock:
