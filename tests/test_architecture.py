@@ -35,8 +35,9 @@ INNER_FLOORS = {
     "pipeline": [
         "__init__",
         "commands",
-        "socket design uncertainty variants",
+        "design uncertainty variants",
         "identification",
+        "socket",
         "records",
         "simulation",
         "limb",

@@ -88,6 +88,7 @@ IN_VAIN: list[tuple[dict[str, Any], dict[str, Any], str]] = [
     ),
     (GIVEN, {"calibration.prior_tissues": {"skin": "none"}}, "calibration.prior_tissues"),
     (GIVEN, {"calibration.seed": 3}, "calibration.seed"),
+    (GIVEN, {"calibration.use_socket_pressures": True}, "calibration.use_socket_pressures"),
     (GIVEN, {"clamps.force_N": 9.0, "calibration.search_radius_mm": 50.0}, "calibration.search_radius_mm"),
     *[
         (

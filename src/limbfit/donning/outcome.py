@@ -27,6 +27,7 @@ RELATIVE_STEP = 1e-4  # of a parameter: how far it is moved where pressures are 
 # What is stored of a simulation that goes on later: the solver's arrays begin with the first.
 SOLVER = "solver."
 FIELDS = ("pressure", "shear", "displacement")
+DERIVATIVES = ("pressure", "displacement", "move")
 STRAINS = ("shear", "compression", "energy_kPa", "volume_mm3")
 
 
@@ -79,9 +80,11 @@ def simulate_donning(
         rows.append(row)
         for name in fit.find_held(step.time):
             pressure, shear = found.average_at_nodes(len(problem.mesh.points))
-            slopes = _compute_slopes(problem, system, laws, step.state, patches) if sensitivities else {}
+            slopes, derivatives = dict[str, Array](), None
+            if sensitivities:
+                slopes, derivatives = _compute_derivatives(problem, system, laws, step.state, patches)
             strains = Strains.from_state(system, laws, step.state)
-            held[name] = LoadedState(row, pressure, shear, step.state.u, strains, slopes)
+            held[name] = LoadedState(row, pressure, shear, step.state.u, strains, slopes, derivatives)
         if on_row is not None:
             on_row(row)
 
@@ -99,14 +102,15 @@ def simulate_donning(
     return DonningResult(result, balanced, held)
 
 
-def _compute_slopes(
+def _compute_derivatives(
     problem: Problem, system: System, laws: Laws, state: State, patches: Mapping[str, Mask]
-) -> dict[str, Array]:
-    """Derivatives (p,) of the mean pressures and of settling, from those of the state."""
+) -> tuple[dict[str, Array], StateDerivatives]:
+    """Derivatives (p,) of the mean pressures and of settling, and of the state itself."""
     found = {name: np.zeros(laws.count) for name in (*patches, SETTLING)}
     assert state.sensitivity is not None
     assert state.bodies is not None
-    for i, value in enumerate(problem.parameters):
+    values, at_nodes = np.array(problem.parameters), np.zeros((len(problem.mesh.points), laws.count))
+    for i, value in enumerate(values):
         ways = []
         for step in (RELATIVE_STEP * value, -RELATIVE_STEP * value):
             there = replace(
@@ -118,11 +122,15 @@ def _compute_slopes(
             at = compute_tractions(system, laws, there)
             areas = at.areas.sum(axis=1)
             ways.append({name: _compute_mean(at, areas, mask) for name, mask in patches.items()})
+            at_nodes[:, i] += np.sign(step) * at.average_at_nodes(len(at_nodes))[0] / (2.0 * RELATIVE_STEP)
         for name in patches:
             found[name][i] = (ways[0][name] - ways[1][name]) / (2.0 * RELATIVE_STEP)
         if len(state.bodies):
             found[SETTLING][i] = value * state.bodies[0, 2, i]
-    return found
+    move = np.zeros((6, laws.count))
+    if len(state.bodies):
+        move[: state.bodies.shape[1]] = values * state.bodies[0]  # one that only shifts has no turns
+    return found, StateDerivatives(at_nodes, values * state.sensitivity, move)
 
 
 def _compute_mean(found: Tractions, areas: Array, chosen: Mask) -> float:
@@ -188,6 +196,7 @@ class LoadedState:
     strains : of the cells.
     slopes : of the whole's and each region's mean pressure, kPa, and of ``settling``, mm, the derivatives
         (p,) with respect to the logarithms of `Problem.parameter_names`; none where they were not asked for.
+    derivatives : likewise of the state itself.
     """
 
     row: SocketStep
@@ -196,6 +205,34 @@ class LoadedState:
     displacement: Array
     strains: Strains
     slopes: Mapping[str, Array]
+    derivatives: StateDerivatives | None = None
+
+    def extrapolate(self, step: Array) -> LoadedState:
+        """Pressure, displacement and place of the socket, to first order, at logarithms that are larger by
+        ``step (p,)``; all else stays.
+        """
+        assert self.derivatives is not None
+        by, row = self.derivatives, self.row
+        move, turn = by.move[:3] @ step, np.degrees(by.move[3:] @ step)
+        return replace(
+            self,
+            row=replace(row, move=row.move + move, turn=row.turn + turn),
+            pressure=self.pressure + by.pressure @ step,
+            displacement=self.displacement + by.displacement @ step,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class StateDerivatives:
+    """Derivatives of a state with respect to the logarithms of its p parameters.
+
+    ``pressure (n, p)`` kPa and ``displacement (n, 3, p)`` mm at the mesh's nodes, ``move (6, p)`` of the
+    socket, mm and rad.
+    """
+
+    pressure: Array
+    displacement: Array
+    move: Array
 
 
 @dataclass(frozen=True)
@@ -284,6 +321,8 @@ def pack(part: DonningCheckpoint) -> tuple[Facts, dict[str, Array]]:
         arrays |= {f"{i}.{field}": getattr(one, field) for field in FIELDS}
         arrays |= {f"{i}.strains.{field}": getattr(one.strains, field) for field in STRAINS}
         arrays |= {f"{i}.slopes.{patch}": slopes for patch, slopes in one.slopes.items()}
+        if one.derivatives is not None:
+            arrays |= {f"{i}.derivatives.{field}": getattr(one.derivatives, field) for field in DERIVATIVES}
         held[name] = {"row": asdict(one.row), "slopes": list(one.slopes)}
     rows = [asdict(row) for row in part.rows]
     return {"solver": dict(part.snapshot.facts), "rows": rows, "held": held}, arrays
@@ -296,8 +335,14 @@ def unpack(facts: Facts, arrays: Mapping[str, Array]) -> DonningCheckpoint:
     for i, (name, one) in enumerate(facts["held"].items()):
         slopes = {patch: arrays[f"{i}.slopes.{patch}"] for patch in one["slopes"]}
         strains = Strains(**{field: arrays[f"{i}.strains.{field}"] for field in STRAINS})
-        fields = {field: arrays[f"{i}.{field}"] for field in FIELDS}
-        held[name] = LoadedState(row=_to_row(one["row"]), strains=strains, slopes=slopes, **fields)
+        fields, derivatives = {field: arrays[f"{i}.{field}"] for field in FIELDS}, None
+        if slopes:
+            known = {field: arrays[f"{i}.derivatives.{field}"] for field in DERIVATIVES}
+            derivatives = StateDerivatives(**known)
+        state = LoadedState(
+            row=_to_row(one["row"]), strains=strains, slopes=slopes, derivatives=derivatives, **fields
+        )
+        held[name] = state
     return DonningCheckpoint(Snapshot(facts["solver"], own), tuple(map(_to_row, facts["rows"])), held)
 
 

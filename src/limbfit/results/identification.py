@@ -251,6 +251,32 @@ class ContactSummary(ResultPart):
     from_rest_percent: float | None = Field(description="Difference of the force from rest, of the largest.")
 
 
+class PressureRound(ResultPart):
+    """One simulation of the socket in the identification, and the answer that followed."""
+
+    parameters: Parameters = Field(description="The parameters of the simulation.")
+    rms_kPa: float = Field(description="Root mean square of simulated minus measured pressures.")
+    bias_kPa: float = Field(description="Mean of them.")
+    scatter_kPa: float = Field(description="Standard deviation beyond the error of the sensors.")
+    moved_sd: float = Field(description="How far the answer then moved all pressures, in deviations.")
+
+
+class SocketPressures(ResultPart):
+    """What pressures that sensors in a socket measured told of the parameters."""
+
+    cells: int = Field(description="Number of cells that were compared.")
+    settled: bool = Field(description="Whether the last answer moved the pressures by less than 0.3.")
+    rounds: Sequence[PressureRound] = Field(description="Each simulation of the socket.")
+    rows: Matrix = Field(description="Derivatives of deviations by the logarithms of all parameters.")
+    target: Sequence[float] = Field(description="Deviations are rows times logarithms, less these.")
+    share: Mapping[str, float] = Field(
+        description="Share of the variance of each logarithm from pressures and priors."
+    )
+    wider_without: Mapping[str, float] = Field(
+        description="Factor by which intervals are wider without pressures and priors."
+    )
+
+
 class CalibrationResult(StoredResult):
     """The identified parameters and how they were found."""
 
@@ -270,6 +296,9 @@ class CalibrationResult(StoredResult):
     warnings: Mapping[str, Sequence[str]] = Field(description="Warnings at the answer, by record.")
     contact: Mapping[str, ContactSummary] = Field(description="Contact at the answer, by record.")
     doubts: SimulationDoubts = Field(description="Doubts about the simulations.")
+    socket_pressures: SocketPressures | None = Field(
+        default=None, description="What measured pressures told; null where they do not count."
+    )
 
     @property
     def parameters(self) -> Parameters:

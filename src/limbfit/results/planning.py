@@ -29,8 +29,10 @@ class SiteDesign(ResultPart):
 
     design: str = Field(description="Name of the choice.")
     sites: Sequence[DesignSite] = Field(description="Its sites.")
-    d_efficiency: float = Field(description="Efficiency for the volume of the confidence region, 1 at most.")
-    a_efficiency: float = Field(description="Efficiency for the mean variance, 1 at most.")
+    d_efficiency: float = Field(
+        description="Efficiency for the volume of the confidence region; the best: 1."
+    )
+    a_efficiency: float = Field(description="Efficiency for the mean variance; the best: 1.")
     factor_95: Mapping[str, float] = Field(description="Factor of the 95 % interval of each parameter.")
     exhaustive: bool = Field(description="Whether every choice was compared.")
 

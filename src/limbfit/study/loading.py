@@ -241,6 +241,11 @@ UNUSED_KEYS: Rules = {
         "one start is not random",
         "give calibration.starts, or leave it out",
     ),
+    ("calibration.use_socket_pressures",): UnusedKeys(
+        lambda s: not s.socket.measured,
+        "no pressure was measured in the socket",
+        "give [[socket.measured]], or leave it out",
+    ),
     ("calibration.search_radius_mm",): UnusedKeys(
         lambda s: s.clamps is not None or bool(s.material.prestretch),
         "the whole limb is clamped or pre-stretched, so parameters are searched on whole meshes",

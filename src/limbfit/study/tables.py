@@ -320,7 +320,8 @@ class CalibrationTable(TomlTable):
     and on coarse meshes where the study has them (``mesh.coarse``); forces of the whole meshes correct that,
     at most ``corrections`` times per stage. The ``answer`` is that of the least squares, which predicts
     forces best, or what noise, misfit and the errors of meshes and sites make most probable; none stated:
-    the first for one record of force per site, the second for more.
+    the first for one record of force per site, the second for more. With ``use_socket_pressures`` what
+    ``socket.measured`` states counts beside the records; the socket is then simulated some times.
     """
 
     answer: Literal["least squares", "most probable"] | None = None
@@ -338,6 +339,7 @@ class CalibrationTable(TomlTable):
     starts: Annotated[int, Field(ge=1, le=1000)] = 1
     seed: Annotated[int, Field(ge=0)] = 0
     search_radius_mm: Annotated[float, Field(ge=0)] = 65.0
+    use_socket_pressures: bool = False
     corrections: Annotated[int, Field(ge=1, le=10)] = 6
     correction_tolerance_percent: Positive = 0.1
 
@@ -353,6 +355,10 @@ class CalibrationTable(TomlTable):
                 raise ValueError(f"tied = {list(group)}: tie two or more parameters of one kind")
         if (self.prior or self.priors) and self.objective == "paper":
             raise ValueError('objective = "paper" has no place for priors; use "pointwise"')
+        if self.use_socket_pressures and "paper" in (self.objective, self.stopping):
+            raise ValueError("use_socket_pressures is not the paper's; leave objective and stopping out")
+        if self.use_socket_pressures and self.answer == "least squares":
+            raise ValueError("use_socket_pressures goes with the most probable answer; leave answer out")
 
 
 class UncertaintyTable(TomlTable):

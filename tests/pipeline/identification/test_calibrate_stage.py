@@ -221,6 +221,9 @@ def test_a_study_that_fixes_a_whole_tissue_has_one_stage_which_is_not_called_one
         ("objective = 'paper'\nprior = { 'skin.m' = { median = 3.0, factor = 2.0 } }", "no place for priors"),
         ("prior = { 'skin.m' = { median = 3.0, factor = 1.0 } }", "factor"),
         ("starts = 0", "starts"),
+        ("use_socket_pressures = true", "no pressure was measured in the socket; give .*socket.measured"),
+        ("use_socket_pressures = true\nobjective = 'paper'", "leave objective and stopping out"),
+        ("use_socket_pressures = true\nanswer = 'least squares'", "leave answer out"),
     ],
 )
 def test_impossible_settings_are_bad_input(tmp_path, text, words):

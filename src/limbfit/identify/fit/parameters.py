@@ -13,6 +13,7 @@ import numpy as np
 
 from ...arrays import Array, Mask
 from ...errors import ProblemError
+from .readings import LinearisedReadings
 
 Grouping = tuple[int, ...]
 
@@ -77,7 +78,7 @@ class Prior:
 class Unknowns:
     """The full parameter vector: ``names``, ``start``, ``lower`` and ``upper``, each (p,), all positive.
 
-    ``priors`` of some of the parameters count in the fit beside the forces.
+    ``priors`` of some of the parameters, and linearised ``readings``, count in the fit beside the forces.
     """
 
     names: tuple[str, ...]
@@ -85,6 +86,7 @@ class Unknowns:
     lower: Array
     upper: Array
     priors: tuple[Prior, ...] = ()
+    readings: LinearisedReadings | None = None
 
     def __post_init__(self) -> None:
         for name, low, start, high in zip(self.names, self.lower, self.start, self.upper, strict=True):
@@ -102,13 +104,17 @@ class Unknowns:
         return np.asarray(np.minimum(low, high) < _BOUND_TOLERANCE_LOG)
 
     def build_prior_rows(self) -> tuple[Array, Array]:
-        """Return ``(A, b)``: ``A @ log(parameters) - b`` is each prior's deviation in standard deviations."""
+        """Return ``(A, b)``: ``A @ log(parameters) - b`` are deviations in standard deviations, from priors
+        and then from readings.
+        """
         rows = np.zeros((len(self.priors), len(self.names)))
         target = np.zeros(len(self.priors))
         for i, prior in enumerate(self.priors):
             rows[i, self.names.index(prior.name)] = 1 / np.log(prior.factor)
             target[i] = np.log(prior.median) / np.log(prior.factor)
-        return rows, target
+        if self.readings is None:
+            return rows, target
+        return np.vstack([rows, self.readings.rows]), np.concatenate([target, self.readings.target])
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from ...study import Indentation, Study
 from ...traces import SurfaceMotion
 from ..engine.context import Listener, Progress, ignore_progress
 from ..engine.store import Store
-from ..identification.search import check_fitted
+from ..identification.calibrate import check_calibrate
 from ..limb.segment import check_labels, read_marked_image, read_study_image, read_study_labels
 from ..limb.sites import place_site
 from ..limb.surfaces import read_given_anatomy
@@ -144,7 +144,7 @@ def _describe_clamps(study: Study, limb: LimbGeometry | None) -> Iterator[str]:
 def list_refused_commands(study: Study, limb: LimbGeometry | None) -> list[dict[str, Any]]:
     """``commands`` that would be refused, and ``why``; ``limb``: None where it is not known yet."""
     found: dict[str, list[str]] = {}
-    checks: list[tuple[str, Callable[[], Any]]] = [("run", partial(check_fitted, study))]
+    checks: list[tuple[str, Callable[[], Any]]] = [("run", partial(check_calibrate, study, limb))]
     for experiment in EXPERIMENTS:
         name = experiment.name
         command = _COMMANDS.get(name, name.replace("sensitivity-", "sensitivity --only "))

@@ -38,6 +38,9 @@ def design_study(
 ) -> dict[str, Any]:
     """The best choice of sites and depths at known parameters, beside the study's own choice.
 
+    Where the study has a current socket, simulated with identified parameters, the study's own choice is also
+    told with sensors in every region of it.
+
     Returns what ``results/design/design.json`` holds, and ``folder``. Raises `InputError` for more sites than
     there are, or identified parameters that are stale.
 
@@ -48,9 +51,11 @@ def design_study(
     parameters : per tissue; by default the identified ones, or the study's start.
     """
     used, origin = choose_parameters(study, parameters)
+    known = origin == IDENTIFIED and _has_socket(study)
     return run_experiment(
         study,
         "design",
+        socket_pressures=_read_socket_pressures(study) if known else {},
         listener=listener,
         sites=sites,
         depths_mm=[float(depth) for depth in depths_mm],
@@ -107,7 +112,7 @@ def plan_protocol(
         indenter, once a second; as much all speeds of a tissue may be off together. None: likewise.
     parameters : per tissue; by default the identified ones, or the study's start.
     """
-    pressures = _read_socket_pressures(study) if SOCKET in determine else {}
+    pressures = _find_relative_slopes(study) if SOCKET in determine else {}
     if pressures and (len(determine) > 1 or criterion == "D"):
         what = "with other parameters" if len(determine) > 1 else 'by the criterion "D"'
         what = f"pressures of a socket are not determined {what}: they are more than the parameters"
@@ -155,25 +160,37 @@ def _choose_speeds(study: Study, loads: Iterable[LoadHistory], depths_mm: Sequen
     return [slow, min(max(_SPEED_FACTOR * slow, fast), limit)]
 
 
-def _read_socket_pressures(study: Study) -> dict[str, list[float]]:
+def _find_relative_slopes(study: Study) -> dict[str, list[float]]:
     """Derivatives (p,) of the logarithm of every mean pressure by those of the parameters.
 
     Raises `InputError` where the study has no current socket, or one without derivatives.
     """
-    store, remedy = Store(study.results), "run limbfit socket on it, with identified parameters, first"
-    place = "--determine socket"
-    if "done" not in [row["state"] for row in study_status(study) if row["stage"] == SOCKET]:
+    remedy, place = "run limbfit socket on it, with identified parameters, first", "--determine socket"
+    if not _has_socket(study):
         raise InputError("the study has no current socket", file=study.file, place=place, remedy=remedy)
+    read = _read_socket_pressures(study)
+    if not read:
+        what = "its socket's pressures have no derivatives"
+        raise InputError(what, file=study.file, place=place, remedy=remedy)
+    return {name: (np.array(slopes) / mean).tolist() for name, (mean, *slopes) in read.items()}
+
+
+def _has_socket(study: Study) -> bool:
+    return "done" in [row["state"] for row in study_status(study) if row["stage"] == SOCKET]
+
+
+def _read_socket_pressures(study: Study) -> dict[str, list[float]]:
+    """Every mean pressure, kPa, and its derivatives (p,) by the logarithms of the parameters.
+
+    None where the socket's parameters were not identified.
+    """
     found = {}
-    for load in store.results.socket.loads:
+    for load in Store(study.results).results.socket.loads:
         for region in load.regions:
-            if region.change_kPa is None:
-                what = "its socket's pressures have no derivatives"
-                raise InputError(what, file=study.file, place=place, remedy=remedy)
-            by = [region.change_kPa.get(f"{tissue}.{name}", 0.0) for tissue, name in study.parameters]
-            slopes = np.array(by) / np.log1p(CHANGE_PERCENT / 100.0)
-            if region.mean_kPa > 0:
-                found[f"{load.name}, {region.region}"] = (slopes / region.mean_kPa).tolist()
+            if region.change_kPa is not None and region.mean_kPa > 0:
+                by = [region.change_kPa.get(f"{tissue}.{name}", 0.0) for tissue, name in study.parameters]
+                slopes = np.array(by) / np.log1p(CHANGE_PERCENT / 100.0)
+                found[f"{load.name}, {region.region}"] = [region.mean_kPa, *slopes.tolist()]
     return found
 
 

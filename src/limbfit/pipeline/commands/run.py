@@ -3,7 +3,7 @@
 import json
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from time import perf_counter
@@ -30,9 +30,8 @@ from ..engine.provenance import (
     record_settings,
 )
 from ..engine.store import Store, keep_hand_labels, lock, read_json, to_plain, write_result
-from ..identification.calibrate import run_calibrate
+from ..identification.calibrate import check_calibrate, run_calibrate
 from ..identification.predict import run_predict
-from ..identification.search import check_fitted
 from ..limb.mesh import run_mesh
 from ..limb.segment import run_segment
 from ..limb.sites import run_sites
@@ -78,8 +77,18 @@ _FOLDERS = frozenset(("compare", "export", "log", "models", "simulate", *STAGE_N
 
 
 def list_stages(study: Study) -> tuple[Stage, ...]:
-    """The stages that a study has: without an image there is nothing to segment."""
-    return tuple(stage for stage in STAGES if stage.name != "segment" or study.image is not None)
+    """The stages that a study has: without an image there is nothing to segment.
+
+    Where pressures in the socket count, the calibration reads what is said of the socket.
+    """
+    stages = [stage for stage in STAGES if stage.name != "segment" or study.image is not None]
+    if not study.calibration.use_socket_pressures:
+        return tuple(stages)
+    apart = ("socket.design", "socket.worn_s")
+    return tuple(
+        replace(one, tables=(*one.tables, "socket"), apart=apart) if one.name == "calibrate" else one
+        for one in stages
+    )
 
 
 def compute_keys(study: Study, until: str = "report") -> dict[str, str]:
@@ -190,14 +199,14 @@ def run_study(
         states = {stage.name: context.store.state(stage.name, chain[stage.name].digest) for stage in wanted}
         missing = {name for name, state in states.items() if name in anew or state.state != "done"}
         if "calibrate" in missing:
-            check_fitted(study)
+            check_calibrate(study)
         # Records need no limb: what is wrong with them is said at once.
         wanted.sort(key=lambda stage: stage.name != "traces")
         with compile_in_background("calibrate" in missing) as compiled:
             for stage in wanted:
                 name = stage.name
                 if name == "mesh":
-                    _check_limb(context, check, name in missing)
+                    _check_limb(context, check, name in missing, "calibrate" in missing)
                 if name == "calibrate":
                     compiled()
                     if name in missing:
@@ -211,12 +220,16 @@ def run_study(
     return summary if until is None else summary | {"until": until}
 
 
-def _check_limb(context: Context, check: Callable[[LimbGeometry], None] | None, meshing: bool) -> None:
+def _check_limb(
+    context: Context, check: Callable[[LimbGeometry], None] | None, meshing: bool, calibrating: bool
+) -> None:
     """Refuse what surfaces, sites and records rule out, before anything is meshed."""
     study, store = context.study, context.store
     if not (meshing or check):
         return
     limb = LimbGeometry.from_store(store)
+    if meshing and calibrating:
+        check_calibrate(study, limb)
     if meshing:
         facts = store.results.traces.sites
         moving = [one for one in study.recorded if (seen := facts[one.name].surface) and seen.compared]

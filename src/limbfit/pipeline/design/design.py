@@ -9,6 +9,7 @@ import numpy as np
 
 from ...anatomy.sites.sites import measure_tissue_under
 from ...anatomy.surfaces.surfaces import load_anatomy
+from ...arrays import Array
 from ...errors import InputError, RunError, StudyError
 from ...identify.checks.design import (
     Candidate,
@@ -21,6 +22,8 @@ from ...identify.checks.design import (
     evaluate_design,
 )
 from ...identify.fit.objective import SiteResponse
+from ...identify.fit.prediction import NORMAL_95
+from ...identify.fit.readings import LinearisedReadings
 from ...indentation import SiteModel
 from ...laws import Parameters
 from ...results.planning import DesignCandidate, DesignResult, DesignSite, ExpectedNoise, SiteDesign
@@ -33,6 +36,9 @@ from ..simulation.limb_geometry import LimbGeometry
 from ..simulation.simulations import build_curve_job, open_experiment_cache
 
 DEFAULT_SITES = 4
+SENSOR_KPA, SENSOR_PERCENT = 2.0, 10.0  # what 95 % of the readings of a sensor in a socket are within
+OWN, WITH_SENSORS = "the study's own", "the study's own, with sensors in the socket"
+_WORTH_TELLING = 0.05  # of the logarithm of an interval's factor
 DEEPEST_SHARE = 0.5  # of the tissue's thickness that a candidate may go
 
 
@@ -78,8 +84,13 @@ def run_design(
     parameters: Parameters = NO_PARAMETERS,
     parameters_from: str = "",
     noise: Mapping[str, float] = {},
+    socket_pressures: Mapping[str, Sequence[float]] = {},
 ) -> None:
-    """Simulate every candidate once, with derivatives, and choose."""
+    """Simulate every candidate once, with derivatives, and choose.
+
+    ``socket_pressures``: mean pressures that sensors may measure, kPa, each followed by its derivatives (p,)
+    with respect to the logarithms of the parameters.
+    """
     study = context.study
     vector = study.vector(parameters)
     models, left_out = _build_candidate_models(context, depths_mm)
@@ -97,7 +108,7 @@ def run_design(
         information = compute_information(response, vector, model_noise)
         found.append((Candidate(model.site, depth, information), simulation.force_N.max()))
     content = DesignResult(
-        **_choose_designs(context, found, count_wanted_sites(study, sites), left_out),
+        **_choose_designs(context, found, count_wanted_sites(study, sites), left_out, socket_pressures),
         parameters=parameters,
         parameters_from=parameters_from,
         noise=ExpectedNoise(**noise),
@@ -133,7 +144,11 @@ def _build_candidate_models(
 
 
 def _choose_designs(
-    context: Context, found: Sequence[tuple[Candidate, float]], sites: int, left_out: list[str]
+    context: Context,
+    found: Sequence[tuple[Candidate, float]],
+    sites: int,
+    left_out: list[str],
+    pressures: Mapping[str, Sequence[float]],
 ) -> dict[str, Any]:
     """The best choices, the study's own, all sites, and the candidates."""
     study = context.study
@@ -152,7 +167,10 @@ def _choose_designs(
     fitted = {site.name for site in study.fitted}
     own = tuple(i for i in _select_deepest(every) if every[i].site in fitted)
     if own:
-        designs["the study's own"] = evaluate_design(every, own, prior)
+        designs[OWN] = evaluate_design(every, own, prior)
+    if own and pressures:
+        with_sensors = prior + _compute_sensor_information(np.array(list(pressures.values())))
+        designs[WITH_SENSORS] = evaluate_design(every, own, with_sensors)
     designs["all sites"] = evaluate_design(every, _select_deepest(every), prior)
     best_d, best_a = designs["D-optimal"], designs["A-optimal"]
     rows = []
@@ -186,6 +204,16 @@ def _choose_designs(
     }
 
 
+def _compute_sensor_information(pressures: Array) -> Array:
+    """What sensors of the usual error tell of log(parameters), (p, p); ``pressures`` (k, 1 + p) as given."""
+    mean, derivatives = pressures[:, 0], pressures[:, 1:]
+    gain = 0.01 * SENSOR_PERCENT / NORMAL_95 * mean  # that of the whole sheet, too
+    covariance = np.diag((SENSOR_KPA / NORMAL_95) ** 2 + gain**2) + np.outer(gain, gain)
+    nothing = np.zeros(derivatives.shape[1])
+    rows = LinearisedReadings.weigh(0.0 * mean, derivatives, covariance, nothing).rows
+    return np.asarray(rows.T @ rows)
+
+
 def _select_deepest(every: Sequence[Candidate]) -> tuple[int, ...]:
     best: dict[str, int] = {}
     for i, one in enumerate(every):
@@ -198,11 +226,17 @@ def _describe_verdict(designs: dict[str, Design], names: Sequence[str]) -> str:
     """In words: what the study's own choice gives away, and what no choice determines."""
     best, every = designs["D-optimal"], designs["all sites"]
     words = []
-    own = designs.get("the study's own")
+    own, with_sensors = designs.get(OWN), designs.get(WITH_SENSORS)
     if own is not None and len(own.chosen) == len(best.chosen):
         share = compute_efficiency(own, best, "D")
         worth = "as good as" if share > 0.95 else f"worth {100 * share:.0f} % of the data of"
         words.append(f"the study's own choice is {worth} the best")
+    if own is not None and with_sensors is not None:
+        narrowed = np.log(own.factors_95) - np.log(with_sensors.factors_95)
+        i = int(narrowed.argmax())
+        factors = f"from a factor of {own.factors_95[i]:.3g} to {with_sensors.factors_95[i]:.3g}"
+        said = f"would narrow {names[i]} most, {factors}" if narrowed[i] > _WORTH_TELLING else "add little"
+        words.append(f"pressures in the socket, measured in every region, {said}")
     wide = [name for name, factor in zip(names, best.factors_95) if factor > 2]
     open_too = [name for name, factor in zip(names, every.factors_95) if factor > 2]
     if wide:

@@ -23,16 +23,27 @@ from ..engine.context import Context
 from ..engine.store import write_result
 from ..limb.remesh import mesh_in_background
 from ..records.records import load_records
+from ..simulation.limb_geometry import LimbGeometry
 from ..simulation.simulations import SimulationCache
+from ..socket.socket import check_socket
 from .answer import correct_answer, plan_coarser_meshes, sample_intervals
+from .pressures import count_pressures
 from .search import (
     CalibrationProblem,
     RecordSimulator,
     SearchWarning,
     WarmStarts,
     build_problem,
+    check_fitted,
     search_from_starts,
 )
+
+
+def check_calibrate(study: Study, limb: LimbGeometry | None = None) -> None:
+    """Refuse what `check_fitted` does, and a socket whose pressures count but which cannot be simulated."""
+    check_fitted(study)
+    if study.calibration.use_socket_pressures:
+        check_socket(study, limb, {})
 
 
 def run_calibrate(context: Context, folder: Path) -> None:
@@ -50,8 +61,12 @@ def run_calibrate(context: Context, folder: Path) -> None:
     with mesh_in_background(coarser, context.executor) as wait:
         starts, rounds = search_from_starts(simulator)
         wait()
-    correction = correct_answer(simulator, starts.best, coarser)
-    found, known = sample_intervals(simulator, starts.best, correction)
+    correction, pressures = correct_answer(simulator, starts.best, coarser), None
+    if study.calibration.use_socket_pressures:
+        pressures = count_pressures(context, folder, simulator, starts.best, correction)
+        found, known = pressures.found, pressures.known
+    else:
+        found, known = sample_intervals(simulator, starts.best, correction)
     corrections = [_summarise_round(one, found.sites, problem) for one in rounds]
     simulations = simulator.run_answer(found.parameters)
     answers = {one.site: one for one in records.select_forces(simulations)}
@@ -72,6 +87,7 @@ def run_calibrate(context: Context, folder: Path) -> None:
         linear_solver=kept[0].facts["linear_solver"] if kept else None,
         element=kept[0].facts["element"] if kept else None,
         corrections=corrections,
+        socket_pressures=None if pressures is None else pressures.summarise(),
         multistart=_summarise_starts(starts, problem) if study.calibration.starts > 1 else None,
         warnings=warnings,
         contact=summarise_contact(

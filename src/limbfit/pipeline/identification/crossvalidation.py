@@ -86,7 +86,7 @@ def run_crossvalidate(
     study, stored = context.study, context.results.calibration
     recorded = [site for site in study.sites if study.records_at(site)]
     size = fit or len(study.fitted)
-    problem, best = build_problem(study), study.vector(stored.parameters)
+    problem, best = build_problem(study, stored), study.vector(stored.parameters)
     problem = replace(problem, unknowns=problem.unknowns.with_start(best))
     records = load_records(context, study.records_at(*recorded), secondary=True)
     cache, report = open_experiment_cache(context, folder), partial(context.tell, "crossvalidate", 0, 0)

@@ -6,7 +6,7 @@ inwards from bounds.
 """
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import partial
 from typing import Literal
 
@@ -35,8 +35,10 @@ from ...identify.fit.parameters import (
     constrain,
     group_by_kind,
 )
+from ...identify.fit.readings import LinearisedReadings
 from ...identify.uncertainty.intervals import EvaluationStore
 from ...indentation import Simulation, SimulationJob
+from ...results.identification import CalibrationResult
 from ...study import Study
 from ..records.records import RecordSet
 from ..simulation.simulations import SimulationCache
@@ -79,10 +81,15 @@ def check_fitted(study: Study) -> None:
         build_problem(study)
 
 
-def build_problem(study: Study) -> CalibrationProblem:
-    """The problem that a study states."""
+def build_problem(study: Study, calibrated: CalibrationResult | None = None) -> CalibrationProblem:
+    """The problem that a study states; with the pressures of a socket as they counted at the end of the
+    ``calibrated`` one.
+    """
     table, tissues = study.calibration, len(study.tissues)
     unknowns, stages = build_unknowns(study), build_groupings(study)
+    if calibrated is not None and (counted := calibrated.socket_pressures) is not None:
+        readings = LinearisedReadings(np.array(counted.rows), np.array(counted.target))
+        unknowns = replace(unknowns, readings=readings)
     one, several = "one material", f"{COUNTS[tissues] if tissues < len(COUNTS) else tissues} materials"
     is_one = stages[-1] == group_by_kind(unknowns.names)
     settings = {one.name: getattr(table, one.name) for one in fields(CalibrationSettings)}
@@ -101,13 +108,15 @@ def build_problem(study: Study) -> CalibrationProblem:
 def is_moved(study: Study) -> bool:
     """Whether the answer is what is most probable, and not the least squares.
 
-    As the study states; else where a fitted site has more than one record of force. What the records' own
-    doubts weigh decides then: errors of touch-down and site that one fit to everything would take for tissue.
+    As the study states; else where a fitted site has more than one record of force, or pressures count. What
+    the records' own doubts weigh decides then: errors of touch-down and site that one fit to everything would
+    take for tissue.
     """
     table, records = study.calibration, study.records_at(*study.fitted)
     if table.answer is not None:
         return table.answer == "most probable"
     more = len(records) > len(study.fitted) or any(record.observed for record in records)
+    more |= table.use_socket_pressures
     return more and "paper" not in (table.objective, table.stopping)
 
 
@@ -190,6 +199,11 @@ class RecordSimulator:
         self.penalties: dict[str, float | None] = {}
         self.warnings: list[SearchWarning] = []
         self._corrections = 0
+
+    def count_readings(self, readings: LinearisedReadings) -> None:
+        """Let readings count in the problem from now on, in the place of earlier ones."""
+        unknowns = replace(self.problem.unknowns, readings=readings)
+        self.problem = replace(self.problem, unknowns=unknowns)
 
     def search(self, parameters: Array) -> Responses:
         """Force and derivatives on the meshes of the search; they are remembered."""

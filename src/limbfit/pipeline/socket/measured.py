@@ -10,11 +10,12 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
 import numpy as np
+from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
 from ...anatomy.meshing.layers import build_liner_surface
@@ -43,6 +44,7 @@ OFF, ALL = "off the socket", "all"  # a cell that the face does not reach, and c
 _TURNS = np.radians(60.0 * np.arange(6))
 DISC = np.vstack([[0.0, 0.0], np.sqrt(2.0 / 3.0) * np.column_stack([np.cos(_TURNS), np.sin(_TURNS)])])
 WEIGHTS = np.array([1 / 4, *[1 / 8] * 6])
+_STEP = 1e-4  # of a parameter's logarithm, for derivatives
 
 
 def read_sensors(study: Study, table: MeasuredTable) -> SensorFrames:
@@ -144,6 +146,49 @@ def compare_measured(
         cells = [dict(zip(columns, values)) for values in zip(*columns.values(), strict=True)]
         sensors.append(SensorComparison.model_validate({**named, "counts": Counter(states), "cells": cells}))
     return sensors, summarise_agreement(sensors)
+
+
+@dataclass(frozen=True, eq=False)
+class CellReadings:
+    """All cells of a study that can be compared with a simulation, whatever their recording.
+
+    ``position`` (n, 3) mm, ``off`` (n,) kPa: measured less simulated, the ``derivatives`` (n, p) of the
+    simulated ones with respect to the logarithms of the study's parameters, and the sensors' ``covariance``
+    (n, n). The stated percentage counts twice: for each cell, and for the gain of its whole recording.
+    """
+
+    position: Array
+    off: Array
+    derivatives: Array
+    covariance: Array
+
+
+def read_cells(run: SocketRun, found: DonningResult) -> CellReadings:
+    """Compare with a simulation that has sensitivities. Errors as `place_sensors`; no cell may be left."""
+    study, names, parts = run.limb.study, list(found.result.parameter_names), []
+    own = [(tissue, parameter.name) for tissue in study.tissues for parameter in study.law.parameters]
+    for table in study.socket.measured:
+        recording, states, _ = place_sensors(study, table, run.face, run.limb.anatomy, run.limb.outer.skin)
+        assert recording.position is not None
+        chosen, held = np.array(states) == COMPARED, found.held[table.load]
+        points, areas = recording.position[chosen], recording.area_mm2[chosen]
+        measured = recording.frames.mean(axis=0)[chosen]
+        derivatives = np.zeros((len(points), len(own)))
+        for i, name in enumerate(own):
+            if name in names:  # fibres that a tissue has not change nothing
+                step = _STEP * np.eye(len(names))[names.index(name)]
+                ends = [sample_pressure(run, held.extrapolate(by), points, areas)[0] for by in (step, -step)]
+                derivatives[:, i] = (ends[0] - ends[1]) / (2.0 * _STEP)
+        model, _ = sample_pressure(run, held, points, areas)
+        # Of simulated pressures: a gain over measured ones would draw the answer to small pressures.
+        gain = 0.01 * table.error_percent / NORMAL_95 * model
+        alone = (table.error_kPa / NORMAL_95) ** 2 + (0.01 * table.error_percent / NORMAL_95 * measured) ** 2
+        parts.append((points, measured - model, derivatives, np.diag(alone) + np.outer(gain, gain)))
+    positions, offs, slopes, covariances = zip(*parts, strict=True)
+    if not sum(map(len, offs)):
+        raise StudyError("no cell can be compared", file=study.file, place="socket.measured")
+    together = np.concatenate(positions), np.concatenate(offs), np.concatenate(slopes)
+    return CellReadings(*together, block_diag(*covariances))
 
 
 def _scale_interval(value: float, rows: Sequence[Mapping[str, Any]]) -> list[float] | None:

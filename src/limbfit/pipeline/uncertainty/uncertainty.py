@@ -64,7 +64,7 @@ def run_uncertainty(context: Context, folder: Path) -> dict[str, Any]:
     calibration = context.results.calibration
     best = study.vector(calibration.parameters)
     earlier = _select_earlier_points(study, calibration)
-    problem, table = build_problem(study), study.uncertainty
+    problem, table = build_problem(study, calibration), study.uncertainty
     records = load_records(context, study.records_at(*study.fitted), secondary=True)
     cache = open_experiment_cache(context, folder)
     simulator = RecordSimulator(problem, records, cache, context.executor, report)

@@ -20,6 +20,7 @@ def make_parameter_section(store: Results) -> Section:
     if known is None:
         return make_section("parameters")
     truth, relaxation, priors = store.truth.get("parameters", {}), known.relaxation, known.priors
+    pressures = store.calibration and store.calibration.socket_pressures
     return make_section(
         "parameters",
         make_table("parameters", store.parameters, store=store, known=known, truth=truth),
@@ -29,6 +30,7 @@ def make_parameter_section(store: Results) -> Section:
         make_table("moduli", relaxation.moduli, store=store) if relaxation else None,
         make_prose("priors", found=priors) if priors else None,
         make_table("priors", store.parameters, store=store, found=priors) if priors else None,
+        make_prose("socket pressures", found=pressures) if pressures else None,
         make_prose("combinations", found=known),
         make_list("list of combinations", found=known, store=store),
         make_prose("residuals", found=known.residuals),

@@ -1,0 +1,83 @@
+"""``calibration.use_socket_pressures``: what sensors in a socket measured counts beside the records."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from limbfit import load_results, load_study, report_study, run_study
+from limbfit.anatomy.meshing.layers import build_liner_surface
+from limbfit.pipeline.commands.planning import choose_tissues
+from limbfit.pipeline.commands.simulate import simulate_site
+from limbfit.pipeline.socket.measured import CellReadings, read_cells
+from limbfit.pipeline.socket.sensors import write_true_sensors
+from limbfit.pipeline.socket.shape import build_loadable_socket, build_regions
+from limbfit.pipeline.socket.simulation import SocketLimb, SocketRun, solve_run
+from small_limb import limb, small_limb
+
+LOADED = """hold_s = 0.0
+[[socket.loads]]
+name = "stance"
+force_N = [0.0, 0.0, 150.0]
+hold_s = 0.0
+"""
+FREE = ("skin.c_kPa", "muscle.c_kPa")
+
+
+@pytest.fixture
+def measured(tmp_path) -> Path:
+    """A limb with sensors in its socket, and the tissues of people."""
+    study = load_study(small_limb(tmp_path, LOADED, edge_mm=22.0))
+    write_true_sensors(tmp_path, limb(), choose_tissues(study, True, None)[0], 0)
+    return tmp_path
+
+
+@pytest.mark.slow
+def test_pressures_of_cells_have_derivatives_with_respect_to_the_tissues(measured):
+    """Against simulations of other tissues, on a mesh so coarse that cells lose contact between them."""
+    study, anatomy = load_study(measured), limb()
+    at = study.vector(choose_tissues(study, True, None)[0])
+    outer, _ = build_liner_surface(anatomy, study.socket.liner.thickness_mm)
+    on = SocketLimb(study, anatomy, outer, None, build_regions(study, anatomy), ())
+    socket = build_loadable_socket(study, anatomy, outer.skin)
+    mesh, _ = on.mesh(measured, socket, lambda words: None)
+
+    def read(parameters: np.ndarray) -> CellReadings:
+        run = SocketRun("socket", on, mesh, study.by_tissue(parameters), socket, sensitivities=True)
+        return read_cells(run, solve_run(run, lambda time, end, words: None))
+
+    number = [f"{tissue}.{name}" for tissue, name in study.parameters].index("muscle.c_kPa")
+    step = 0.03 * np.eye(len(at))[number]
+    here, less, more = (read(at * np.exp(by)) for by in (0.0 * step, -step, step))
+    expected, found = (less.off - more.off) / 0.06, here.derivatives[:, number]
+    assert np.corrcoef(expected, found)[0, 1] > 0.95
+    assert np.median(np.abs(found - expected)) < 0.03 * np.abs(expected).max()
+
+
+@pytest.mark.slow
+def test_pressures_determine_what_one_shallow_record_leaves_open(measured):
+    """The truth lies within intervals that are narrower than those of the record alone."""
+    study = load_study(measured)
+    truth, _ = choose_tissues(study, True, None)
+    simulate_site(study, "1", parameters=truth)
+    (measured / "1.csv").write_bytes((measured / "results" / "simulate" / "1.csv").read_bytes())
+    fixed = [name for name in map(".".join, study.parameters) if name not in FREE]
+    text = study.file.read_text().replace("depth_mm = 3.0", 'trace = "1.csv"\nfitted = true')
+    text += f"\n[calibration]\nuse_socket_pressures = true\nfixed = {fixed}\n"
+    for tissue, values in truth.items():
+        beside = values | {"c_kPa": 1.5 * values["c_kPa"]}
+        start = ", ".join(f"{key} = {value}" for key, value in beside.items())
+        text += f"[material.tissues.{tissue}]\nstart = {{ {start} }}\n"
+    study.file.write_text(text)
+    run_study(load_study(measured))
+    found = load_results(measured).calibration
+    told, known = found.socket_pressures, found.uncertainty
+    assert told.settled
+    assert told.cells > 80
+    for tissue in truth:
+        low, high = known.intervals_95[tissue]["c_kPa"]
+        assert low < truth[tissue]["c_kPa"] < high
+        assert told.wider_without[f"{tissue}.c_kPa"] > 1.0
+    print(told, known.intervals_95)
+    page = Path(report_study(load_study(measured))["report"]).read_text()
+    assert "in the socket measured count beside the records" in page
