@@ -21,18 +21,18 @@ from typing import Any
 import numpy as np
 from foreign_meshes import named_bodies
 from numpy.typing import NDArray
-
-from limbfit.anatomy.imaging import LabelMap, write_labels
-from limbfit.anatomy.sites.sites import measure_tissue_under
-from limbfit.anatomy.surfaces.mending import build_closed_anatomy
-from limbfit.anatomy.surfaces.surfaces import Anatomy, Surface, write_surface
-from limbfit.bench.meshing import (
+from site_meshes import (
     CALF_PAD_MM,
     CALF_PLANE,
     INDENTER_MM,
     draw_random_sites,
     make_amputated_calf,
 )
+
+from limbfit.anatomy.imaging import LabelMap, write_labels
+from limbfit.anatomy.sites.sites import measure_tissue_under
+from limbfit.anatomy.surfaces.mending import build_closed_anatomy
+from limbfit.anatomy.surfaces.surfaces import Anatomy, Surface, write_surface
 from limbfit.phantom.build import draw_true_parameters
 from limbfit.phantom.geometry import extract_contour, make_limb
 from limbfit.phantom.mri import build_true_labels, make_grid

@@ -31,6 +31,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from site_meshes import CALF_PAD_MM, CALF_PLANE, INDENTER_MM, draw_random_sites, measure_cpu_seconds
 
 from limbfit.anatomy.imaging import read_volume
 from limbfit.anatomy.meshing.layers import LayerSpec
@@ -42,7 +43,6 @@ from limbfit.anatomy.surfaces.mending import build_closed_anatomy, open_loops
 from limbfit.anatomy.surfaces.surfaces import Anatomy, Surface, build_anatomy, find_bodies, read_surface
 from limbfit.anatomy.surfaces.thickness import measure_fat_depth
 from limbfit.anatomy.surfaces.triangles import from_pyvista
-from limbfit.bench.meshing import CALF_PAD_MM, CALF_PLANE, INDENTER_MM, draw_random_sites, measure_cpu_seconds
 from limbfit.errors import LimbfitError
 from limbfit.fe import solve
 from limbfit.indentation import SiteModel, build_problem, build_steps

@@ -72,7 +72,7 @@ def open_page(launch: Callable[..., Any]) -> Iterator[Callable[..., Any]]:
     yield start
     for page in pages:
         page.close()
-    assert said == []
+    assert said == [], said
 
 
 @pytest.fixture

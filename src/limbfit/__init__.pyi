@@ -7,7 +7,6 @@ from .anatomy.surfaces.exchange import (
     compare_shapes as compare_shapes,
     convert_shape as convert_shape,
 )
-from .bench.meshing import bench_meshing as bench_meshing
 from .bench.parity import bench_febio_parity as bench_febio_parity
 from .bench.timing import (
     bench_forward as bench_forward,

@@ -1,12 +1,17 @@
 """The benchmark of meshes counts what failed and measures what was made."""
 
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
+from site_meshes import bench_meshing, draw_random_sites, make_phantom_limb
 
 from limbfit.anatomy.meshing.layers import LayerSpec
 from limbfit.anatomy.meshing.meshing import MeshSettings
 from limbfit.anatomy.surfaces.surfaces import Anatomy
-from limbfit.bench.meshing import bench_meshing, draw_random_sites, make_phantom_limb
 from limbfit.errors import InputError
 from small_limb import limb
 

@@ -39,13 +39,17 @@ def test_they_count_after_the_priors():
     np.testing.assert_allclose(target, [np.log(2.0), *found.target])
 
 
-def test_scatter_beyond_the_sensors_error_is_found_and_alike_among_neighbours():
+def test_what_a_simulation_lacks_is_a_mean_of_all_and_a_scatter_alike_among_neighbours():
     random = np.random.default_rng(0)
     places = random.uniform(0.0, 400.0, (900, 3))
     own = np.eye(900)
     distance = np.linalg.norm(places[:, None] - places, axis=2)
     root = np.linalg.cholesky(own + 4.0 * np.exp(-distance / 10.0))
-    covariance, scatter = add_scatter(own, root @ random.normal(size=900), places, 10.0)
-    assert scatter == pytest.approx(2.0, rel=0.1)
-    np.testing.assert_allclose(covariance[0, 1] / scatter**2, np.exp(-distance[0, 1] / 10.0))
-    assert add_scatter(own, 0.5 * random.normal(size=900), places, 10.0)[1] == 0.0
+    off = root @ random.normal(size=900)
+    covariance, missed = add_scatter(own, off - off.mean() + 3.0, places, 10.0)
+    assert missed == pytest.approx(np.hypot(2.0, 3.0), rel=0.05)
+    far, near = (covariance[0, 1:][pick(distance[0, 1:])] for pick in (np.argmax, np.argmin))
+    assert far == pytest.approx(9.0)
+    assert near > 9.1
+    off = 0.5 * random.normal(size=900)
+    assert add_scatter(own, off - off.mean(), places, 10.0)[1] == pytest.approx(0.0, abs=1e-9)

@@ -71,6 +71,49 @@ def test_pressure_is_stepped_through_and_read_under_the_pointer(study, serve, op
     until(lambda: words.inner_text().startswith("stance; contact pressure at most 20.0 kPa"))
 
 
+def cell(name: str, at: np.ndarray, measured: float, model: float, state: str = "compared") -> dict:
+    place = {"position_mm": at.tolist(), "level_mm": 50.0, "angle_deg": 0.0, "error_kPa": 1.5}
+    return {"cell": name, "state": state, "regions": [], "measured_kPa": measured, "model_kPa": model} | place
+
+
+@pytest.mark.slow
+def test_cells_of_sensors_are_drawn_beside_the_limb_with_their_agreement(study, serve, open_page, tmp_path):
+    results, middle = study / "results", block().points.mean(axis=0)
+    content = write_run(results, "socket", "held", 5.0)
+    cells = [
+        cell("1-1", middle + np.array([8.0, 0.0, 0.0]), 20.0, 26.0),
+        cell("1-2", middle + np.array([8.0, 0.0, 3.0]), 40.0, 38.0),
+        cell("1-3", middle + np.array([8.0, 0.0, -3.0]), 0.0, 30.0, "dead"),
+    ]
+    content["sensors"] = [{"name": "sheet", "load": "stance", "counts": {}, "cells": cells}]
+    row = {"load": "stance", "region": "all", "cells": 2, "measured_kPa": 30.0, "model_kPa": 32.0}
+    content["agreement"] = [row | {"bias_kPa": 2.0, "limits_kPa": [-9.1, 13.1], "within_percent": 50.0}]
+    (results / "socket" / "socket.json").write_text(json.dumps(complete(SocketResult, content)))
+    (results / "socket" / "stage.json").write_text(json.dumps(complete(StageStamp, {})))
+    page = open_page(serve(study) + "#/socket")
+    chosen, means = page.get_by_label("sensors", exact=True), page.locator(".socket-cells")
+    chosen.select_option("measured_kPa")
+    until(lambda: means.inner_text() == "no sensor recorded this step")  # it is donning
+    canvas = page.locator(".view.socket .lf-canvas")
+    page.get_by_label("step", exact=True).fill("1")
+    until(lambda: means.inner_text() == "in the colours of the bar; grey rings are not compared")
+    measured = canvas.screenshot()
+    chosen.select_option("difference")
+    until(lambda: "−6.00 to 6.00 kPa" in means.inner_text())
+    until(lambda: canvas.screenshot() != measured)
+    page.get_by_role("cell", name="-9.1 to 13.1").wait_for()
+    page.get_by_role("button", name="left", exact=True).click()
+    box = canvas.bounding_box()
+    page.mouse.click(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+    until(
+        lambda: (
+            "cell 1-1 of sheet: measured 20.0 ± 1.5 kPa, model 26.0 kPa" in page.inner_text(".socket-pointed")
+        )
+    )
+    page.screenshot(path=str(tmp_path / "cells.png"))
+    assert serious_findings(page) == []
+
+
 @pytest.mark.slow
 def test_two_runs_stand_beside_each_other_on_one_scale_and_turn_together(study, serve, open_page):
     results = study / "results"

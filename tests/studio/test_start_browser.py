@@ -2,7 +2,6 @@
 
 import json
 import re
-import shutil
 from pathlib import Path
 from typing import Any
 
@@ -134,4 +133,3 @@ def test_from_a_folder_of_dicom_to_a_running_calibration(tmp_path, serve, open_p
     page.get_by_role("button", name="Stop").click()
     until(lambda: not page.locator("#strip .running").count(), 120)
     assert StudyResults(folder / "results").mesh.sites.keys() == {site.name for site in load(folder).sites}
-    shutil.rmtree(folder)

@@ -1,4 +1,4 @@
-"""``limbfit bench``: the solver against FEBio's results, its time and memory, meshes, identification."""
+"""``limbfit bench``: the solver against FEBio's results, its time and memory, identification."""
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -14,7 +14,7 @@ from ..execution import count_usable_cores
 from . import console
 from .console import AsJson, Column
 
-app = Typer(help="Benchmarks of solver, meshes, identification.", no_args_is_help=True, rich_markup_mode=None)
+app = Typer(help="Benchmarks of solver and identification.", no_args_is_help=True, rich_markup_mode=None)
 
 Reference = Annotated[Path | None, Option(help="FEBio's results; default: shared/reference, here or above")]
 Threads = Annotated[int, Option(min=1, help="threads of the linear algebra; default: all cores")]
@@ -104,24 +104,6 @@ def show_scaling(result: dict[str, Any]) -> None:
     columns |= {"seconds": ("seconds", ".1f"), "memory (MB)": ("max_rss_MB", ".0f")}
     console.print_table((*result["sizes"], result["paper_sized"]), columns)
     console.print_line(f"seconds grow as unknowns^{result['seconds_exponent']:.2f}")
-
-
-@app.command()
-def meshing(
-    shared: Annotated[Path | None, Option(help="real limbs; default: shared, here or above")] = None,
-    sites: Annotated[int, Option(min=1, help="sites on each of the five limbs")] = 20,
-    engine: Annotated[str, Option(help="name of the mesher")] = "mmg",
-    as_json: AsJson = False,
-) -> None:
-    """Mesh random sites of five limbs: failures, angles, thickness, volume, time."""
-    _bench("meshing", limbfit.bench_meshing, (shared, sites, engine), show_meshing, as_json)
-
-
-def show_meshing(result: dict[str, Any]) -> None:
-    show_facts({key: value for key, value in result.items() if key != "limbs"})
-    for name, facts in result["limbs"].items():
-        console.print_line(name)
-        show_facts(facts)
 
 
 @app.command()

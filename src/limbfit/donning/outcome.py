@@ -6,7 +6,7 @@ What was found so far is packed as facts and arrays, so that a simulation that w
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Self
 
 import numpy as np
@@ -27,7 +27,7 @@ RELATIVE_STEP = 1e-4  # of a parameter: how far it is moved where pressures are 
 # What is stored of a simulation that goes on later: the solver's arrays begin with the first.
 SOLVER = "solver."
 FIELDS = ("pressure", "shear", "displacement")
-DERIVATIVES = ("pressure", "displacement", "move")
+MAPPED = ("slopes", "derivatives")
 STRAINS = ("shear", "compression", "energy_kPa", "volume_mm3")
 
 
@@ -80,7 +80,7 @@ def simulate_donning(
         rows.append(row)
         for name in fit.find_held(step.time):
             pressure, shear = found.average_at_nodes(len(problem.mesh.points))
-            slopes, derivatives = dict[str, Array](), None
+            slopes, derivatives = dict[str, Array](), dict[str, Array]()
             if sensitivities:
                 slopes, derivatives = _compute_derivatives(problem, system, laws, step.state, patches)
             strains = Strains.from_state(system, laws, step.state)
@@ -104,7 +104,7 @@ def simulate_donning(
 
 def _compute_derivatives(
     problem: Problem, system: System, laws: Laws, state: State, patches: Mapping[str, Mask]
-) -> tuple[dict[str, Array], StateDerivatives]:
+) -> tuple[dict[str, Array], dict[str, Array]]:
     """Derivatives (p,) of the mean pressures and of settling, and of the state itself."""
     found = {name: np.zeros(laws.count) for name in (*patches, SETTLING)}
     assert state.sensitivity is not None
@@ -130,7 +130,7 @@ def _compute_derivatives(
     move = np.zeros((6, laws.count))
     if len(state.bodies):
         move[: state.bodies.shape[1]] = values * state.bodies[0]  # one that only shifts has no turns
-    return found, StateDerivatives(at_nodes, values * state.sensitivity, move)
+    return found, {"pressure": at_nodes, "displacement": values * state.sensitivity, "move": move}
 
 
 def _compute_mean(found: Tractions, areas: Array, chosen: Mask) -> float:
@@ -196,7 +196,8 @@ class LoadedState:
     strains : of the cells.
     slopes : of the whole's and each region's mean pressure, kPa, and of ``settling``, mm, the derivatives
         (p,) with respect to the logarithms of `Problem.parameter_names`; none where they were not asked for.
-    derivatives : likewise of the state itself.
+    derivatives : likewise of the state itself: of ``pressure (n, p)`` kPa and ``displacement (n, 3, p)`` mm
+        at the mesh's nodes, and of ``move (6, p)`` of the socket, mm and rad.
     """
 
     row: SocketStep
@@ -205,34 +206,20 @@ class LoadedState:
     displacement: Array
     strains: Strains
     slopes: Mapping[str, Array]
-    derivatives: StateDerivatives | None = None
+    derivatives: Mapping[str, Array] = field(default_factory=dict)
 
     def extrapolate(self, step: Array) -> LoadedState:
         """Pressure, displacement and place of the socket, to first order, at logarithms that are larger by
         ``step (p,)``; all else stays.
         """
-        assert self.derivatives is not None
         by, row = self.derivatives, self.row
-        move, turn = by.move[:3] @ step, np.degrees(by.move[3:] @ step)
+        move, turn = by["move"][:3] @ step, np.degrees(by["move"][3:] @ step)
         return replace(
             self,
             row=replace(row, move=row.move + move, turn=row.turn + turn),
-            pressure=self.pressure + by.pressure @ step,
-            displacement=self.displacement + by.displacement @ step,
+            pressure=self.pressure + by["pressure"] @ step,
+            displacement=self.displacement + by["displacement"] @ step,
         )
-
-
-@dataclass(frozen=True, eq=False)
-class StateDerivatives:
-    """Derivatives of a state with respect to the logarithms of its p parameters.
-
-    ``pressure (n, p)`` kPa and ``displacement (n, 3, p)`` mm at the mesh's nodes, ``move (6, p)`` of the
-    socket, mm and rad.
-    """
-
-    pressure: Array
-    displacement: Array
-    move: Array
 
 
 @dataclass(frozen=True)
@@ -320,10 +307,10 @@ def pack(part: DonningCheckpoint) -> tuple[Facts, dict[str, Array]]:
     for i, (name, one) in enumerate(part.held.items()):
         arrays |= {f"{i}.{field}": getattr(one, field) for field in FIELDS}
         arrays |= {f"{i}.strains.{field}": getattr(one.strains, field) for field in STRAINS}
-        arrays |= {f"{i}.slopes.{patch}": slopes for patch, slopes in one.slopes.items()}
-        if one.derivatives is not None:
-            arrays |= {f"{i}.derivatives.{field}": getattr(one.derivatives, field) for field in DERIVATIVES}
-        held[name] = {"row": asdict(one.row), "slopes": list(one.slopes)}
+        held[name] = {"row": asdict(one.row)}
+        for kind in MAPPED:
+            arrays |= {f"{i}.{kind}.{key}": array for key, array in getattr(one, kind).items()}
+            held[name][kind] = list(getattr(one, kind))
     rows = [asdict(row) for row in part.rows]
     return {"solver": dict(part.snapshot.facts), "rows": rows, "held": held}, arrays
 
@@ -333,16 +320,10 @@ def unpack(facts: Facts, arrays: Mapping[str, Array]) -> DonningCheckpoint:
     own = {name.removeprefix(SOLVER): array for name, array in arrays.items() if name.startswith(SOLVER)}
     held = {}
     for i, (name, one) in enumerate(facts["held"].items()):
-        slopes = {patch: arrays[f"{i}.slopes.{patch}"] for patch in one["slopes"]}
+        fields: Facts = {field: arrays[f"{i}.{field}"] for field in FIELDS}
+        fields |= {kind: {part: arrays[f"{i}.{kind}.{part}"] for part in one[kind]} for kind in MAPPED}
         strains = Strains(**{field: arrays[f"{i}.strains.{field}"] for field in STRAINS})
-        fields, derivatives = {field: arrays[f"{i}.{field}"] for field in FIELDS}, None
-        if slopes:
-            known = {field: arrays[f"{i}.derivatives.{field}"] for field in DERIVATIVES}
-            derivatives = StateDerivatives(**known)
-        state = LoadedState(
-            row=_to_row(one["row"]), strains=strains, slopes=slopes, derivatives=derivatives, **fields
-        )
-        held[name] = state
+        held[name] = LoadedState(row=_to_row(one["row"]), strains=strains, **fields)
     return DonningCheckpoint(Snapshot(facts["solver"], own), tuple(map(_to_row, facts["rows"])), held)
 
 

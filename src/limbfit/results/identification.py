@@ -257,7 +257,7 @@ class PressureRound(ResultPart):
     parameters: Parameters = Field(description="The parameters of the simulation.")
     rms_kPa: float = Field(description="Root mean square of simulated minus measured pressures.")
     bias_kPa: float = Field(description="Mean of them.")
-    scatter_kPa: float = Field(description="Standard deviation beyond the error of the sensors.")
+    scatter_kPa: float = Field(description="What the simulation lacks beyond the error of the sensors.")
     moved_sd: float = Field(description="How far the answer then moved all pressures, in deviations.")
 
 

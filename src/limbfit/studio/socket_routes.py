@@ -60,7 +60,8 @@ class SocketRunRequest(StrictModel):
 def list_runs(folder: StudyFolder) -> list[Json]:
     """Stored runs: ``run``, ``steps`` (name, regions, settling_mm), ``mark``, which other fields change.
 
-    ``outside``: what it does to the tissue that no fitted record did, in words.
+    ``outside``: what it does to the tissue that no fitted record did, in words. ``sensors`` and
+    ``agreement``: measured pressures, as `SocketResult` has them.
     """
     single, designed = SocketResult.find(folder.results), SocketDesignResult.find(folder.results)
     runs: dict[str, SocketSimulation] = {SOCKET: single} if single else {}
@@ -69,11 +70,19 @@ def list_runs(folder: StudyFolder) -> list[Json]:
         {
             "run": name,
             "steps": [_describe_step(title, state) for title, state in run.states.items()],
-            "outside": run.outside_text if isinstance(run, SocketResult) else [],
+            **_describe_measured(run if isinstance(run, SocketResult) else None),
             "mark": compute_fingerprint(_find_file(folder, name, i) for i in range(len(run.states))),
         }
         for name, run in runs.items()
     ]
+
+
+def _describe_measured(run: SocketResult | None) -> Json:
+    return {
+        "outside": run.outside_text if run else [],
+        "sensors": [one.model_dump(include={"name", "load", "cells"}) for one in run.sensors] if run else [],
+        "agreement": [one.model_dump() for one in run.agreement] if run else [],
+    }
 
 
 def _describe_step(name: str, state: SocketState) -> Json:

@@ -44,12 +44,14 @@ class LinearisedReadings:
 
 
 def add_scatter(covariance: Array, off: Array, places: Array, length_mm: float) -> tuple[Array, float]:
-    """Add to a covariance (n, n) of readings what scatters beyond it, and return its standard deviation too.
+    """Add to a covariance (n, n) of readings what a simulation lacks, and return its standard deviation too.
 
-    Readings are ``off`` (n,) from a simulation. What their own errors do not explain in the mean square is
-    the simulation's, and alike in ``places`` (n, 3), mm, closer than ``length_mm``: their correlation falls
-    exponentially.
+    Readings are ``off`` (n,) from the simulation. Their mean is taken for an error of it that all of them
+    share. What their own errors do not explain of the scatter about that mean is alike in ``places`` (n, 3),
+    mm, closer than ``length_mm``: its correlation falls exponentially.
     """
-    variance = max(float(np.mean(off**2) - np.trace(covariance) / len(off)), 0.0)
+    bias = float(off.mean())
+    scatter = max(float(off.var() - np.trace(covariance) / len(off)), 0.0)
     distance = np.linalg.norm(places[:, None] - places, axis=2)
-    return covariance + variance * np.exp(-distance / length_mm), float(np.sqrt(variance))
+    missed = bias**2 + scatter * np.exp(-distance / length_mm)
+    return covariance + missed, float(np.sqrt(bias**2 + scatter))

@@ -63,8 +63,7 @@ def run_calibrate(context: Context, folder: Path) -> None:
         wait()
     correction, pressures = correct_answer(simulator, starts.best, coarser), None
     if study.calibration.use_socket_pressures:
-        pressures = count_pressures(context, folder, simulator, starts.best, correction)
-        found, known = pressures.found, pressures.known
+        found, known, pressures = count_pressures(context, folder, simulator, starts.best, correction)
     else:
         found, known = sample_intervals(simulator, starts.best, correction)
     corrections = [_summarise_round(one, found.sites, problem) for one in rounds]
@@ -87,7 +86,7 @@ def run_calibrate(context: Context, folder: Path) -> None:
         linear_solver=kept[0].facts["linear_solver"] if kept else None,
         element=kept[0].facts["element"] if kept else None,
         corrections=corrections,
-        socket_pressures=None if pressures is None else pressures.summarise(),
+        socket_pressures=pressures,
         multistart=_summarise_starts(starts, problem) if study.calibration.starts > 1 else None,
         warnings=warnings,
         contact=summarise_contact(

@@ -4,8 +4,6 @@ The socket is simulated at the answer with derivatives, and what is most probabl
 as they are to first order about it. That is repeated until it no longer moves what is compared.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -30,48 +28,18 @@ TOLERANCE_SD = 0.3  # of what all pressures together tell: it is enough that the
 NOT_SETTLED = "the parameters still moved when the socket had been simulated as often as it may be"
 
 
-@dataclass(frozen=True)
-class PressureAnswer:
-    """The answer ``found`` to records and pressures, what is ``known`` of it, how many cells counted as which
-    ``readings``, and the simulations of the socket that led there.
-    """
-
-    found: Calibration
-    known: Uncertainty
-    readings: LinearisedReadings
-    cells: int
-    rounds: Sequence[PressureRound]
-
-    @property
-    def has_settled(self) -> bool:
-        """True if the last round moved the pressures by less than they tell."""
-        return self.rounds[-1].moved_sd < TOLERANCE_SD
-
-    def summarise(self) -> SocketPressures:
-        """What is stored."""
-        known = self.known
-        return SocketPressures(
-            cells=self.cells,
-            settled=self.has_settled,
-            rounds=self.rounds,
-            rows=self.readings.rows.tolist(),
-            target=self.readings.target.tolist(),
-            share=dict(zip(known.names, known.prior_share.tolist(), strict=True)),
-            wider_without=dict(zip(known.names, known.wider_without.tolist(), strict=True)),
-        )
-
-
 def count_pressures(
     context: Context,
     folder: Path,
     simulator: RecordSimulator,
     answer: Calibration,
     correction: FineMeshCorrection,
-) -> PressureAnswer:
+) -> tuple[Calibration, Uncertainty, SocketPressures]:
     """Find what is most probable by records and pressures, from the ``answer`` to the records alone.
 
-    ``folder`` is the stage's own. The simulator's problem counts the pressures from then on. Raises
-    `RunError` where the socket cannot be simulated.
+    Returned are that, what is known of it, and what the pressures told. ``folder`` is the stage's own. The
+    simulator's problem counts the pressures from then on. Raises `RunError` where the socket cannot be
+    simulated.
     """
     study, tell = context.study, partial(context.tell, "calibrate", 0, 0)
     limb = SocketLimb.from_context(context, "calibrate")
@@ -100,12 +68,21 @@ def count_pressures(
         )
         words = f"{len(cells.off)} cells off by {rounds[-1].rms_kPa:.1f} kPa (RMS)"
         tell(f"{title}: {words}, then parameters that move them by {moved:.2f} deviations")
-        now, made = found.parameters, PressureAnswer(found, known, readings, len(cells.off), rounds)
-        if made.has_settled or len(rounds) == MAX_ROUNDS:
+        now, settled = found.parameters, moved < TOLERANCE_SD
+        if settled or len(rounds) == MAX_ROUNDS:
             break
-    if not made.has_settled:
+    if not settled:
         tell(f"warning: {NOT_SETTLED}")
-    return made
+    content = SocketPressures(
+        cells=len(cells.off),
+        settled=settled,
+        rounds=rounds,
+        rows=readings.rows.tolist(),
+        target=readings.target.tolist(),
+        share=dict(zip(known.names, known.prior_share.tolist(), strict=True)),
+        wider_without=dict(zip(known.names, known.wider_without.tolist(), strict=True)),
+    )
+    return found, known, content
 
 
 def _simulate_cells(context: Context, run: SocketRun, title: str) -> CellReadings:

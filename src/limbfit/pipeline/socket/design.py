@@ -228,11 +228,9 @@ def _summarise_design(one: _Design) -> dict[str, Any]:
 
 
 def _write_fields(folder: Path, one: _Design) -> None:
-    """The face with its offset from the unloaded limb, and the fields after donning and each load."""
+    """The face, and the fields after donning and each load."""
     run = one.run
-    face = run.face.surface.to_pyvista()
-    face.point_data["offset_mm"] = -run.face.offset(run.limb.outer.skin)
-    face.save(folder / f"{run.name}-face.vtp")
+    run.write_face(folder / f"{run.name}-face.vtp")
     names = dict.fromkeys(key.rpartition(".")[0] for key in one.fields)
     for i, name in enumerate(names):
         data = {"pressure_kPa": one.fields[f"{name}.pressure"], "shear_kPa": one.fields[f"{name}.shear"]}

@@ -146,6 +146,12 @@ class SocketRun:
             loads=tuple(loads),
         )
 
+    def write_face(self, file: Path) -> None:
+        """Write the face with its signed distance from the unloaded limb, negative where pressed in."""
+        face = self.face.surface.to_pyvista()
+        face.point_data["offset_mm"] = -self.face.offset(self.limb.outer.skin)
+        face.save(file)
+
     @cached_property
     def faces(self) -> dict[str, NDArray[np.bool_]]:
         """Which faces (f,) under the socket belong to each region: those whose nearest skin does."""

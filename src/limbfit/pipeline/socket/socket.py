@@ -75,6 +75,7 @@ def run_socket(
     mesh, facts = limb.mesh(folder, socket, partial(context.tell, NAME, 0, 0))
     kept = ResultFiles(folder / RUNS, also=[context.store[NAME] / RUNS])
     run = SocketRun(NAME, limb, mesh, parameters, socket, kept, sensitivities=covariance_log is not None)
+    run.write_face(folder / "socket-face.vtp")
     found = solve_run(run, partial(context.tell, NAME))
     known = None
     if covariance_log is not None:

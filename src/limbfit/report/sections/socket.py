@@ -44,6 +44,7 @@ def make_socket_section(store: Results, content: stored.SocketResult) -> Section
         Note(write_words("socket note")),
         make_prose("socket shape", content=content),
         (Note(f"The socket's file: {text}.") for text in content.socket.notes),
+        draw_offset_figure(store, {"socket": folder / "socket-face.vtp"}, "socket-offset"),
         make_prose("socket loads", content=content),
         draw_pressure_figures(store, files, "socket"),
         draw_settling_figure(content),
@@ -114,7 +115,9 @@ def make_socket_design_section(store: Results, content: stored.SocketDesignResul
         "socket_design",
         Note(write_words("socket design note")),
         make_prose("socket design", content=content),
-        draw_offset_figure(store, {one.name: folder / f"{one.name}-face.vtp" for one in designs}),
+        draw_offset_figure(
+            store, {one.name: folder / f"{one.name}-face.vtp" for one in designs}, "socket-design-offset"
+        ),
         make_prose("socket design loads", designs=designs),
         draw_pressure_figures(store, held, "socket-design"),
         make_table("socket-design-regions", designs[0].peaks_kPa, designs=designs, limits=limits),
@@ -171,7 +174,7 @@ def _render_surfaces(
 
 
 @pictures.silence_display_warning()
-def draw_offset_figure(store: Results, files: Mapping[str, Path]) -> Figure | None:
+def draw_offset_figure(store: Results, files: Mapping[str, Path], name: str) -> Figure | None:
     """Faces of sockets by their titles, coloured by how far outside the unloaded limb they are."""
     faces = {title: pv.read(file) for title, file in files.items() if file.is_file()}
     if not faces:
@@ -180,7 +183,7 @@ def draw_offset_figure(store: Results, files: Mapping[str, Path]) -> Figure | No
     limits = (-max(limit, 0.1), max(limit, 0.1))
     bar = (limits, "offset from the unloaded limb (mm)")
     rows = _render_surfaces(store, faces, OFFSET, bar, OFFSET_MAP)
-    return pictures.make_picture_figure("socket-design-offset", rows)
+    return pictures.make_picture_figure(name, rows)
 
 
 @pictures.silence_display_warning()

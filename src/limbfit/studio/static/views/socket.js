@@ -6,6 +6,7 @@ import { link, Pane } from "/static/views/socket_pane.js";
 
 const FIELDS = { pressure: "contact pressure", shear: "shear" };
 const RUNS = "runs", SHAPE = "shape";
+const CELLS = { "": "not shown", measured_kPa: "measured (kPa)", model_kPa: "model (kPa)", difference: "model minus measured (kPa)" };
 
 export function mount(element, context) {
   const view = new SocketView(element, context);
@@ -27,6 +28,8 @@ class SocketView {
     this.beside = choice([["", "nothing"]], () => this.reread(() => this.load()));
     this.field = choice(Object.entries(FIELDS).map(([key, text]) => [key, `${text} (kPa)`]), () => this.reread(() => this.read()));
     this.colours = choice(["viridis", "cividis"].map((name) => [name, name]), () => (this.shaping ? this.editor.paint() : this.scale()));
+    this.cells = choice(Object.entries(CELLS), () => this.showCells());
+    this.cellWords = el("output", { class: "hint socket-cells" });
     this.slider = el("input", { type: "range", min: "0", max: "0", step: "1", value: "0", "aria-label": "step", oninput: () => this.show() });
     this.words = el("output", { class: "player-words" });
     this.pointed = el("output", { class: "hint socket-pointed" });
@@ -36,8 +39,9 @@ class SocketView {
     main.append(this.stages, this.bar, this.table);
     this.panes = [this.pane()];
     this.editor = new ShapeEditor(this);
-    if (this.viewer) Object.assign(this.viewer, { onSite: (name) => this.editor.choose(name), onMesh: (point) => this.shaping && this.editor.placed(point) });
-    this.ofRuns = el("div", {}, labelled("run", this.run), labelled("beside it", this.beside), labelled("show", this.field));
+    if (this.viewer) Object.assign(this.viewer, { onSite: (name) => (this.shaping ? this.editor.choose(name) : this.showCells(name)), onMesh: (point) => this.shaping && this.editor.placed(point) });
+    this.ofRuns = el("div", {}, labelled("run", this.run), labelled("beside it", this.beside), labelled("show", this.field),
+      (this.ofCells = el("div", {}, labelled("sensors", this.cells), this.cellWords)));
     const starters = (name) => [["Run the socket", false], ["Run the design", true]].map(([text, design]) =>
       el("button", { type: "button", class: name, onclick: () => this.start(design) }, text));
     this.starters = starters();
@@ -199,6 +203,7 @@ class SocketView {
     if (this.panes.some((pane) => !pane.frames.length)) return;
     const high = Math.max(...this.panes.map((pane) => pane.high));
     for (const pane of this.panes) pane.scale(this.map(), high, `${FIELDS[this.field.value]} (kPa)`);
+    this.showCells();
   }
 
   show() {
@@ -208,7 +213,21 @@ class SocketView {
     this.words.textContent = told.length > 1 ? told.map((text, i) => `${this.panes[i].run.run}: ${text}`).join(" | ") : told[0];
     this.slider.setAttribute("aria-valuetext", name);
     const outside = this.panes[0].run.outside.map((text) => el("p", { class: "hint doubt" }, `⚠ ${text}`));
-    replace(this.table, told.length > 1 ? compared(this.panes) : single(this.panes[0].step), ...outside);
+    const agreed = this.panes[0].run.agreement.filter((row) => row.load === name);
+    replace(this.table, told.length > 1 ? compared(this.panes) : single(this.panes[0].step),
+      ...(agreed.length ? [agreement(agreed, name)] : []), ...outside);
+    this.showCells();
+  }
+
+  /** Cells of sensors that recorded the step, in the chosen quantity; the chosen one in words. */
+  showCells(chosen) {
+    const [pane] = this.panes, step = pane.step?.name;
+    const cells = (pane.run?.sensors ?? []).filter((one) => one.load === step).flatMap((one) => one.cells.map((cell) => ({ ...cell, sensor: one.name })));
+    this.ofCells.hidden = !pane.run?.sensors.length;
+    const cell = cells.find((one) => one.cell === chosen), what = this.cells.value;
+    const means = pane.run ? pane.showCells(what ? cells : [], what, this.map(), pane.shared, cell) : "";
+    this.cellWords.textContent = what && !cells.length ? "no sensor recorded this step" : means;
+    if (cell) this.pointed.textContent = describeCell(cell);
   }
 }
 
@@ -218,6 +237,19 @@ function single(step) {
   return table(["region", "mean (kPa)", "95 % (kPa)", "peak (kPa)", "shear (kPa)"],
     step.regions.map((row) => [row.region, number(row.mean_kPa), row.interval_kPa?.map(number).join(" to ") ?? "–", number(row.peak_kPa), number(row.shear_kPa)]),
     `Regions, ${step.name}`);
+}
+
+function describeCell(cell) {
+  const read = cell.measured_kPa === null ? "no reading" : `measured ${number(cell.measured_kPa)} ± ${number(cell.error_kPa)} kPa`;
+  const interval = cell.interval_kPa ? ` (95 %: ${cell.interval_kPa.map(number).join(" to ")})` : "";
+  return `cell ${cell.cell} of ${cell.sensor}: ${read}, model ${number(cell.model_kPa)} kPa${interval}; ${cell.state}; ${cell.regions[0] ?? "no region"}`;
+}
+
+/** How model and measured pressures agree by region (Bland and Altman). */
+function agreement(rows, name) {
+  return table(["region", "cells", "measured (kPa)", "model (kPa)", "model minus measured (kPa)", "95 % of differences (kPa)", "within errors (%)"],
+    rows.map((row) => [row.region, String(row.cells), number(row.measured_kPa), number(row.model_kPa), number(row.bias_kPa),
+      row.limits_kPa?.map(number).join(" to ") ?? "–", String(Math.round(row.within_percent))]), `Measured pressures, ${name}`);
 }
 
 /** Means and peaks of two runs, and by how much the second's peak differs. */

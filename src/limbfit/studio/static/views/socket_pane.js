@@ -1,9 +1,11 @@
 // One picture of the view Socket: a stored run, the limb coloured by what the socket does to it at a step.
 import { el } from "/static/dom.js";
 import { readArrays } from "/web/arrays.js";
-import { shortNumber } from "/web/colours.js";
+import { mapBytes, shortNumber } from "/web/colours.js";
 import { canDraw, Viewer } from "/web/viewer.js";
 import { loadMesh, NO_WEBGL, REGION_COLOURS } from "/static/views/parts.js";
+
+const OUTSIDE_MM = 8, NOT_COMPARED = "#8a8a8a";
 
 export class Pane {
   constructor(host, context) {
@@ -53,6 +55,7 @@ export class Pane {
   }
 
   scale(map, high, title) {
+    this.shared = high;
     this.viewer?.setColours({ map, low: 0, high, beyond: [false, false], title });
   }
 
@@ -66,6 +69,31 @@ export class Pane {
     this.viewer?.setMoment({ on: "nodes", values }, null);
     const settled = typeof step.settling_mm === "number" ? `; settles by ${step.settling_mm.toFixed(1)} mm` : "";
     return `${step.name}; ${what} at most ${shortNumber(largest(values))} kPa at a node${settled}`;
+  }
+
+  /** Cells of sensors outside of the limb in the colours of a quantity, `difference` for model minus measured; what the colours mean, in words. */
+  showCells(cells, what, map, high, chosen) {
+    if (!this.viewer) return "";
+    const middle = [0, 1, 2].map((k) => mean(this.mesh.points.filter((_, i) => i % 3 === k)));
+    const most = largest(cells.filter(isCompared).map((cell) => Math.abs(cell.model_kPa - cell.measured_kPa)));
+    const bytes = mapBytes(map);
+    const paint = (cell) => {
+      if (!isCompared(cell)) return NOT_COMPARED;
+      if (what === "difference") return diverging((cell.model_kPa - cell.measured_kPa) / (most || 1));
+      const at = 4 * Math.round(255 * Math.min(1, cell[what] / (high || 1)));
+      return hex([...bytes.slice(at, at + 3)]);
+    };
+    const marks = cells.map((cell) => {
+      const inward = [middle[0] - cell.position_mm[0], middle[1] - cell.position_mm[1], 0];
+      const axis = inward.map((value) => value / (Math.hypot(...inward) || 1));
+      const at = cell.position_mm.map((value, k) => value - OUTSIDE_MM * axis[k]);
+      return { name: cell.cell, at, axis, colour: paint(cell), filled: isCompared(cell), chosen: cell === chosen };
+    });
+    this.viewer.setSites(marks, 3);
+    this.viewer.overlay.showSites(false);
+    if (!cells.length) return "";
+    const others = cells.some((cell) => !isCompared(cell)) ? "; grey rings are not compared" : "";
+    return what === "difference" ? `blue to red: model minus measured, −${shortNumber(most)} to ${shortNumber(most)} kPa${others}` : `in the colours of the bar${others}`;
   }
 
   /** What the node nearest to the pointer bears, in words. */
@@ -99,6 +127,16 @@ export function link(one, other) {
     };
   }
   one.view.update();
+}
+
+const isCompared = (cell) => cell.state === "compared";
+const hex = (bytes) => `#${bytes.map((value) => Math.round(value).toString(16).padStart(2, "0")).join("")}`;
+const mean = (values) => values.reduce((sum, value) => sum + value, 0) / values.length;
+
+/** From blue at -1 over white to red at 1. */
+function diverging(share) {
+  const end = share < 0 ? [33, 102, 172] : [178, 24, 43];
+  return hex(end.map((value) => 247 + Math.abs(share) * (value - 247)));
 }
 
 function largest(values) {

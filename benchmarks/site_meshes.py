@@ -1,8 +1,12 @@
 """Site meshes at random sites of five limbs: failures, angles, thickness, volume, time.
 
+    python benchmarks/site_meshes.py [--sites 20] [--engine netgen] [--shared FOLDER]
+
 The limbs are phantoms of several seeds, a mean residuum, and a real calf that is amputated virtually.
 """
 
+import argparse
+import json
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -11,19 +15,19 @@ from typing import Any
 
 import numpy as np
 
-from ..anatomy.imaging import read_volume
-from ..anatomy.meshing.engines import ENGINES
-from ..anatomy.meshing.meshing import MeshSettings, build_base_mesh, mesh_site
-from ..anatomy.segmentation.amputation import amputate_limb
-from ..anatomy.segmentation.segmentation import segment
-from ..anatomy.sites.sites import compute_indenter_axis
-from ..anatomy.surfaces.surfaces import Anatomy, build_anatomy, check_anatomy, read_surface
-from ..arrays import Array
-from ..errors import InputError, LimbfitError
-from ..phantom.geometry import make_limb
-from ..phantom.mri import build_true_labels, make_grid
-from ..results.limb import MeshMeasures
-from .parity import Tell, find_reference
+from limbfit.anatomy.imaging import read_volume
+from limbfit.anatomy.meshing.engines import ENGINES
+from limbfit.anatomy.meshing.meshing import MeshSettings, build_base_mesh, mesh_site
+from limbfit.anatomy.segmentation.amputation import amputate_limb
+from limbfit.anatomy.segmentation.segmentation import segment
+from limbfit.anatomy.sites.sites import compute_indenter_axis
+from limbfit.anatomy.surfaces.surfaces import Anatomy, build_anatomy, check_anatomy, read_surface
+from limbfit.arrays import Array
+from limbfit.bench.parity import Tell, find_reference
+from limbfit.errors import InputError, LimbfitError
+from limbfit.phantom.geometry import make_limb
+from limbfit.phantom.mri import build_true_labels, make_grid
+from limbfit.results.limb import MeshMeasures
 
 SITES = 20
 SEEDS = (0, 1, 2)
@@ -163,3 +167,17 @@ def draw_random_sites(anatomy: Anatomy, count: int, seed: int = 0) -> list[tuple
     faces = random.choice(len(area), count, p=area / area.sum())
     points = np.einsum("ni,nij->nj", random.dirichlet(np.ones(3), count), corners[faces])
     return [(point, compute_indenter_axis(anatomy.skin, point, INDENTER_MM)) for point in points]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--sites", type=int, default=SITES, help="of each limb")
+    parser.add_argument("--engine", default="mmg", choices=sorted(ENGINES), help="the mesher")
+    parser.add_argument("--shared", type=Path, help="folder with data and reference; default: here or above")
+    asked = parser.parse_args()
+    tell = lambda done, total, text: print(f"{done} of {total}: {text}", flush=True)  # noqa: E731
+    print(json.dumps(bench_meshing(asked.shared, asked.sites, asked.engine, tell=tell), indent=1))
+
+
+if __name__ == "__main__":
+    main()
