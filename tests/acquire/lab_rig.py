@@ -7,6 +7,7 @@ Names of faults are those of ``FAULTS``; their time counts from the first move t
 millisecond in which the stage advances towards the limb goes to ``FILE.log``: time, position, true force.
 """
 
+import re
 import select
 import socket
 import sys
@@ -15,8 +16,9 @@ from pathlib import Path
 
 SKIN_MM = 6.0
 ACCELERATION_MM_S2 = 400.0
-# From `at_s` on the sensor answers nan, the same (dead), nothing (lost), or after `late_s` (late); the stage
-# answers nothing, or stands (stuck). `scale` is that of all readings.
+# With `zaber` the stage speaks Zaber's ASCII protocol. From `at_s` on the sensor answers nan, the same
+# (dead), nothing (lost), or after `late_s` (late); the stage answers nothing, stands (stuck), refuses to move
+# (reject) or reports a stall (stalled). `scale` is that of all readings.
 FAULTS = {
     "at_s": 1.0,
     "nan": 0,
@@ -26,6 +28,9 @@ FAULTS = {
     "late_s": 0.2,
     "stage": 0,
     "stuck": 0,
+    "reject": 0,
+    "stalled": 0,
+    "zaber": 0,
     "scale": 1.0,
 }
 TOML = """
@@ -33,9 +38,7 @@ name = "bench"
 rate_hz = 100
 [stage]
 address = "tcp://127.0.0.1:{stage}"
-position = "POS?"
-move = "MOVE {{position:.4f}},{{speed:.4f}}"
-stop = "STOP"
+{commands}
 mm_per_unit = 0.001
 stroke_mm = 40
 [force]
@@ -44,6 +47,14 @@ read = "READ?"
 range_N = 50
 resolution_N = {resolution}
 """
+
+
+COMMANDS = """position = "POS?"
+move = "MOVE {position:.4f},{speed:.4f}"
+stop = "STOP\""""
+LIBRARY = 'library = "zaber-motion"'
+ZABER = re.compile(r"/1 1 (\d\d) ([^:]*):[0-9A-F]{2}\r?")
+SPEED_FACTOR = 1.6384  # of Zaber's speeds over microsteps a second
 
 
 def compute_force(depth_mm: float) -> float:
@@ -97,6 +108,28 @@ class Bench:
             self.target = self.position + self.speed * abs(self.speed) / (2 * ACCELERATION_MM_S2)
         return f"{1000 * self.position:.1f}" if verb == "POS?" else "OK"
 
+    def answer_zaber(self, text: str) -> str | None:
+        """As Zaber's protocol manual has it: what was asked, a number of the message, a checksum."""
+        found = ZABER.fullmatch(text)
+        if found is None:
+            return None
+        number, asked = found.groups()
+        verb, _, words = asked.partition(" ")
+        refused, data = verb == "move" and self.has_fault("reject"), "0"
+        if asked == "get pos":
+            data = self.answer_stage("POS?")
+        elif verb == "stop":
+            data = self.answer_stage("STOP") and "0"
+        elif verb == "move" and not refused:
+            _, position, speed = words.split()
+            data = self.answer_stage(f"MOVE {position},{float(speed) / SPEED_FACTOR}") and "0"
+        if data is None:
+            return None
+        flag = "FS" if self.has_fault("stalled") else "--"
+        status = "BUSY" if abs(self.speed) > 0 else "IDLE"
+        said = f"01 1 {number} {'RJ' if refused else 'OK'} {status} {flag} {'BADDATA' if refused else data}"
+        return f"@{said}:{-sum(said.encode()) & 0xFF:02X}\r"
+
     def answer_force(self, text: str) -> str | None:
         if text.startswith("HANG "):  # what a person does with a weight
             self.weight_N = float(text[5:]) * 9.80665
@@ -116,11 +149,13 @@ def main(file: Path, options: dict[str, float]) -> None:
     stage, force = (one.getsockname()[1] for one in listeners)
     with Path(f"{file}.log").open("w") as log:
         bench = Bench(options, log)
-        answers = dict(zip(listeners, (bench.answer_stage, bench.answer_force), strict=True))
+        answer_stage = bench.answer_zaber if options["zaber"] else bench.answer_stage
+        answers = dict(zip(listeners, (answer_stage, bench.answer_force), strict=True))
         open_now: dict[socket.socket, list] = {}
         late: list[tuple[float, socket.socket]] = []  # answers that are due later
         late_answer = b""
-        file.write_text(TOML.format(stage=stage, force=force, resolution=options["resolution"]))
+        ports = {"stage": stage, "force": force, "commands": LIBRARY if options["zaber"] else COMMANDS}
+        file.write_text(TOML.format(resolution=options["resolution"], **ports))
         print("ready", flush=True)
         while True:
             ready, _, _ = select.select([*listeners, *open_now], [], [], 0.001)

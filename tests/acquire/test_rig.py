@@ -96,8 +96,8 @@ def is_home(file: Path) -> bool:
     port = int(read_rig(file).stage.address.rsplit(":", 1)[1])
     with socket.create_connection(("127.0.0.1", port)) as wire:
         wire.settimeout(1.0)
-        wire.sendall(b"POS?\n")
-        return float(wire.recv(32)) < 150.0
+        wire.sendall(b"/1 1 00 get pos:2C\n" if read_rig(file).stage.library else b"POS?\n")
+        return float(wire.recv(64).split(b":")[0].split()[-1]) < 150.0
 
 
 def test_a_site_is_recorded_and_the_record_is_the_tissue(planned: Path, start: Start) -> None:
@@ -150,6 +150,37 @@ def test_each_hazard_ends_the_session_before_the_force_is_over_its_limit(
         assert found["phase"] == "unreachable"
     else:
         assert found["phase"] == "stopped"
+        assert is_home(file)
+
+
+# of a stage driven by its vendor's library
+ZABER_HAZARDS = {
+    "none": ({}, ""),
+    "stuck stage": ({"stuck": 1, "at_s": 0.5}, "stopped by itself: stuck"),
+    "stuck sensor": ({"dead": 1, "at_s": 2.4}, "feels no force|shows the same"),
+    "lost link to the stage": ({"stage": 1, "at_s": 2.4}, "the stage does not answer"),
+    "rejected command": ({"reject": 1, "at_s": 2.4}, "BADDATA"),
+    "stall": ({"stalled": 1, "at_s": 2.4}, "the stage reports the fault FS"),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", list(ZABER_HAZARDS))
+def test_a_stage_of_zabers_is_driven_and_each_of_its_hazards_ends_the_session(
+    name: str, planned: Path, start: Start
+) -> None:
+    """Its library speaks to a process that answers in the protocol."""
+    pytest.importorskip("zaber_motion")
+    options, reason = ZABER_HAZARDS[name]
+    file = start(zaber=1, **options)
+    store_check(file, 1.0)
+    found = record(planned, file)
+    log = read_log(file)
+    assert log[:, 2].max() < LIMIT_N
+    assert found["completed"] == (name == "none"), found["reason"]
+    assert re.search(reason, found["reason"]), found["reason"]
+    assert (planned / "1.csv").exists() == (name == "none")
+    if name in ("none", "stuck sensor"):
         assert is_home(file)
 
 

@@ -139,18 +139,26 @@ def connect(address: str, timeout_s: float = 5.0) -> Link:
     """Open the wire of an address: ``tcp://HOST[:PORT]`` or ``serial:PATH[@BAUD]``. Raises `InputError` for
     an address of neither form, and `RunError` where nobody listens, or the port cannot be opened.
     """
+    is_tcp, place, number = parse_address(address)
+    if not is_tcp:
+        return SerialLink(place, number)
+    try:
+        return TcpLink(socket.create_connection((place, number), timeout=timeout_s))
+    except (OSError, OverflowError) as error:
+        reason = getattr(error, "strerror", None) or "no answer"
+        what = f"no device at {place}, port {number}: {reason}; start it, or see limbfit virtual-fitsocket"
+        raise RunError(what) from None
+
+
+def parse_address(address: str) -> tuple[bool, str, int]:
+    """True with host and port, or False with the path and baud rate of a serial port. Errors as `connect`."""
     if match := _TCP.match(address):
-        host, port = match[1].strip("[]"), int(match[2] or DEFAULT_PORT)
+        port = int(match[2] or DEFAULT_PORT)
         if not 0 < port < 1 << 16:
             raise InputError(f"there is no port {port}", place="--device", remedy="ports are 1 to 65535")
-        try:
-            return TcpLink(socket.create_connection((host, port), timeout=timeout_s))
-        except (OSError, OverflowError) as error:
-            reason = getattr(error, "strerror", None) or "no answer"
-            what = f"no device at {host}, port {port}: {reason}; start it, or see limbfit virtual-fitsocket"
-            raise RunError(what) from None
+        return True, match[1].strip("[]"), port
     if match := _SERIAL.match(address):
-        return SerialLink(match[1], int(match[2] or BAUD))
+        return False, match[1], int(match[2] or BAUD)
     remedy = f"give tcp://HOST:PORT ({DEFAULT_ADDRESS}) or serial:PATH@BAUD (serial:/dev/ttyUSB0@{BAUD})"
     raise InputError("not an address of a device", place="--device", remedy=remedy)
 

@@ -12,13 +12,14 @@ import time
 from contextlib import suppress
 from hashlib import sha256
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from ..errors import InputError, RunError
+from ..extensions import import_extra
 from . import line_protocol as wire
-from .device import Link, connect, read_model
+from .device import Link, connect, parse_address, read_model
 from .line_protocol import Flags, Sample
 
 LOOKAHEAD_S = 0.1
@@ -29,6 +30,14 @@ RETRACT_UM_S = 20_000
 GRAVITY_N_KG = 9.80665
 MAX_RATIO_ERROR = 0.05  # of a known weight
 CHECK_AGE_S = 24 * 3600.0
+# Of Zaber's ASCII protocol: positions in microsteps, speeds in microsteps a second times a factor.
+ZABER = {
+    "position": "get pos",
+    "move": "move abs {position:.0f} {speed:.0f}",
+    "stop": "stop",
+    "speed_factor": 1.6384,
+}
+NOT_HOMED = ("WR", "WH")  # flags of a stage that does not know where it is
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
@@ -45,16 +54,27 @@ class StageTable(_Table):
 
     ``position`` is answered by a number; ``answers``: the other commands are answered by a line, too. A
     ``move`` replaces the one before it. ``mm_per_unit`` is negative where its numbers fall towards the limb,
-    and ``home`` is its number when it is withdrawn.
+    and ``home`` is its number when it is withdrawn. ``speed_factor`` is that of its speeds over units a
+    second. With a vendor's ``library`` its commands are known, and say which ``device`` and ``axis``.
     """
 
+    library: Literal["zaber-motion"] | None = None
+    device: Annotated[int, Field(ge=1, le=99)] = 1
+    axis: Annotated[int, Field(ge=1, le=9)] = 1
     position: str
     move: str
     stop: str
     answers: bool = True
     mm_per_unit: Finite = 1.0
+    speed_factor: Positive = 1.0
     home: Finite = 0.0
     stroke_mm: Positive
+
+    @model_validator(mode="before")
+    @classmethod
+    def add_commands(cls, stated: Any) -> Any:
+        """Add those of a library."""
+        return {**ZABER, **stated} if isinstance(stated, dict) and stated.get("library") else stated
 
 
 class ForceTable(_Table):
@@ -123,6 +143,41 @@ class Instrument:
         self._link.close()
 
 
+class ZaberStage(Instrument):
+    """A stage of Zaber's through the vendor's own library; errors as `Instrument`, and for a stage at fault.
+
+    The library adds addresses, numbers and checksums of messages. It is asked nothing for which it would look
+    a device up, so that nothing leaves the machine.
+    """
+
+    def __init__(self, table: StageTable) -> None:
+        self._errors = import_extra("zaber_motion", "zaber").MotionLibException
+        connection = import_extra("zaber_motion.ascii", "zaber").Connection
+        self._to = {"device": table.device, "axis": table.axis, "timeout": math.ceil(table.timeout_ms)}
+        is_tcp, place, number = parse_address(table.address)
+        try:
+            self._connection = (connection.open_tcp if is_tcp else connection.open_serial_port)(place, number)
+        except self._errors as error:
+            raise RunError(f"no stage at {table.address}: {error}") from None
+
+    def write(self, text: str) -> None:
+        self.ask(text)
+
+    def ask(self, text: str) -> str:
+        try:
+            reply = self._connection.generic_command(text, **self._to)
+        except self._errors as error:
+            raise RunError(f"the stage does not answer as it should: {error}") from None
+        if reply.warning_flag in NOT_HOMED:
+            raise RunError(f"the stage does not know where it is ({reply.warning_flag}): home it first")
+        if reply.warning_flag.startswith("F"):
+            raise RunError(f"the stage reports the fault {reply.warning_flag}: see the vendor's program")
+        return str(reply.data)
+
+    def close(self) -> None:
+        self._connection.close()
+
+
 class Rig:
     """A stage and a sensor as a session's device (`Device`); its samples have times of this machine's clock.
 
@@ -147,7 +202,7 @@ class Rig:
             serial=table.name,
             calibrated=checked,
         )
-        self._stage = Instrument("the stage", stage)
+        self._stage = ZaberStage(stage) if stage.library else Instrument("the stage", stage)
         try:
             self._sensor = Instrument("the force sensor", force)
         except (InputError, RunError):
@@ -270,7 +325,8 @@ class Rig:
     def _command_move(self, target_um: int, speed_um_s: int) -> None:
         stage = self.table.stage
         position = stage.home + target_um / 1000 / stage.mm_per_unit
-        self._command(stage.move.format(position=position, speed=abs(speed_um_s / 1000 / stage.mm_per_unit)))
+        speed = stage.speed_factor * abs(speed_um_s / 1000 / stage.mm_per_unit)
+        self._command(stage.move.format(position=position, speed=speed))
 
     def _command(self, text: str) -> None:
         if self.table.stage.answers:
