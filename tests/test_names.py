@@ -130,7 +130,6 @@ NOT_VERBS = {
     "_coupling": "a noun of mechanics",
     "grown": "users call it of SmoothSurface",
     "in_solver_units": "users call it of TissueLaw",
-    "meshing": "a command",
     "of": "a constructor: users call that of Motion, Shape and SmoothSurface",
     "of_record": "users call it of TissueLaw",
     "of_tissues": "a constructor",

@@ -7,6 +7,8 @@ Names of faults are those of ``FAULTS``; their time counts from the first move t
 millisecond in which the stage advances towards the limb goes to ``FILE.log``: time, position, true force.
 """
 
+import contextlib
+import os
 import re
 import select
 import socket
@@ -145,6 +147,8 @@ class Bench:
 
 
 def main(file: Path, options: dict[str, float]) -> None:
+    with contextlib.suppress(OSError):  # hardware does not wait for other programs
+        os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(10))
     listeners = [socket.create_server(("127.0.0.1", 0)) for _ in range(2)]
     stage, force = (one.getsockname()[1] for one in listeners)
     with Path(f"{file}.log").open("w") as log:
