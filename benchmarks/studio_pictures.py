@@ -69,14 +69,15 @@ def film(page: Any, patient: Path, folder: Path, shot: Callable[[str], None]) ->
     wait_for(lambda: not page.locator("#strip .running").count(), page)
     page.get_by_role("button", name="Take the markers").click()
     truth = json.loads((patient / "truth.json").read_text())["sites"]
-    wait_for(lambda: len(load_study(folder, recorded=False).sites) == len(truth), page)
+    wait_for(lambda: load_study(folder, recorded=False).sites, page)
     shot("sites")
+    placed = {site.name: site.near for site in load_study(folder, recorded=False).sites}
     page.get_by_role("tab", name="Traces").click()
-    for site in load_study(folder, recorded=False).sites:
-        off = {one["name"]: np.linalg.norm(np.subtract(site.near, one["position_mm"])) for one in truth}
-        page.locator(f"[data-site='{site.name}']").click()
+    for one in truth:
+        off = {name: np.linalg.norm(np.subtract(at, one["position_mm"])) for name, at in placed.items()}
+        page.locator(f"[data-site='{min(off, key=off.__getitem__)}']").click()
         page.locator(".view.traces .state.empty input[type=file]").wait_for()
-        drop(page, ".view.traces .record", patient / "traces" / f"site-{min(off, key=off.__getitem__)}.csv")
+        drop(page, ".view.traces .record", patient / "traces" / f"site-{one['name']}.csv")
         page.locator("#trace-facts").wait_for()
     shot("records")
     page.get_by_role("tab", name="Identification").click()
