@@ -8,6 +8,7 @@ import pytest
 import limbfit
 from conftest import COARSE, write_trace
 from limbfit.errors import InputError
+from limbfit.pipeline.design.design import OWN, WITH_SENSORS
 from limbfit.pipeline.design.protocol import DESIGNED
 from small_limb import LIMB, small_limb
 
@@ -35,10 +36,25 @@ def study(tmp_path_factory) -> limbfit.Study:
 
 
 @pytest.mark.slow
-def test_the_records_for_a_socket_tell_its_pressures_best(study) -> None:
-    """By the sum of the variances of their logarithms, which no simpler session of that time makes less."""
+def test_a_design_says_what_sensors_in_the_socket_would_add(study) -> None:
     with pytest.raises(InputError, match="no current socket"):
         limbfit.plan_protocol(study, determine=("socket",), **SESSION)
+    assert WITH_SENSORS not in [row["design"] for row in limbfit.design_study(study)["designs"]]
+    limbfit.fit_socket(study)
+    found = limbfit.design_study(study)
+    own, more = (
+        next(row["factor_95"] for row in found["designs"] if row["design"] == name)
+        for name in (OWN, WITH_SENSORS)
+    )
+    assert all(more[name] <= own[name] * (1 + 1e-12) for name in own)
+    assert more["muscle.c_kPa"] < own["muscle.c_kPa"]
+    assert "pressures in the socket, measured in every region, " in found["verdict"]
+    assert WITH_SENSORS in Path(limbfit.report_study(study)["report"]).read_text().replace("&#39;", "'")
+
+
+@pytest.mark.slow
+def test_the_records_for_a_socket_tell_its_pressures_best(study) -> None:
+    """By the sum of the variances of their logarithms, which no simpler session of that time makes less."""
     socket = limbfit.fit_socket(study)
     found = limbfit.plan_protocol(study, determine=("socket",), **SESSION)
     regions = [one["region"] for one in socket["loads"][0]["regions"] if one["mean_kPa"] > 0]
