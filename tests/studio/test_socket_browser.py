@@ -91,7 +91,7 @@ def test_cells_of_sensors_are_drawn_beside_the_limb_with_their_agreement(study, 
     (results / "socket" / "socket.json").write_text(json.dumps(complete(SocketResult, content)))
     (results / "socket" / "stage.json").write_text(json.dumps(complete(StageStamp, {})))
     page = open_page(serve(study) + "#/socket")
-    chosen, means = page.get_by_label("sensors", exact=True), page.locator(".socket-cells")
+    chosen, means = page.get_by_role("combobox", name="sensors"), page.locator(".socket-cells")
     chosen.select_option("measured_kPa")
     until(lambda: means.inner_text() == "no sensor recorded this step")  # it is donning
     canvas = page.locator(".view.socket .lf-canvas")
