@@ -9,6 +9,7 @@ with software WebGL; LIMBFIT_CHROMIUM names another program.
 import argparse
 import json
 import os
+import re
 import shutil
 import sys
 import time
@@ -83,7 +84,7 @@ def film(page: Any, patient: Path, folder: Path, shot: Callable[[str], None]) ->
     page.get_by_role("tab", name="Identification").click()
     page.get_by_role("button", name="Run what is missing").click()
     identification = page.locator(".view.identification")
-    wait_for(lambda: "evaluation 6" in identification.inner_text(), page)
+    wait_for(lambda: re.search(r"evaluation ([5-9]|\d\d)", identification.inner_text()), page)
     shot("search")
     wait_for((folder / "results" / "report" / "report.html").is_file, page)
     wait_for(lambda: not page.locator("#strip .running").count(), page)
