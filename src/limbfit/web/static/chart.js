@@ -90,7 +90,7 @@ export class Chart {
       mode: 2, width: Math.max(this.plot.clientWidth, 200), height: this.height, legend: { show: false },
       cursor: { drag: { x: true, y: true, uni: 20, setScale: false }, points: { show: false } },
       scales: { x: { time: false, range: () => this.zoom?.x ?? this.ends.x }, y: { distr: y.log ? 3 : 1, range: () => this.zoom?.y ?? this.ends.y } },
-      axes: [axis(x, { size: 30 }), axis(y, { size: 56, values: (_, ticks) => ticks.map((tick) => tick === null ? "" : shortTick(tick)) })],
+      axes: [axis(x, { size: 30 }), axis(y, { size: 56, values: (_, ticks) => ticks.map((tick) => tick === null ? "" : shortTick(tick, y.log ? 2 : 6)) })],
       series: [{}, ...series.map((one) => this.seriesOptions(one))],
       hooks: {
         drawAxes: [(plot) => this.drawBand(plot)], draw: [(plot) => this.drawMark(plot)],
@@ -238,8 +238,8 @@ export class Chart {
   }
 }
 
-function shortTick(tick) {
-  return String(Number(tick.toPrecision(6))).replace("-", "−");
+function shortTick(tick, digits) {
+  return String(Number(tick.toPrecision(digits))).replace("-", "−");
 }
 
 function clipToPlot(plot) {

@@ -69,6 +69,8 @@ export class Player {
     this.slider.max = String(Math.max(0, this.times.length - 1));
     this.words.textContent = "";
     this.settings.hidden = !chosen;
+    if (!chosen && this.site.records?.length === 0)
+      return { text: "This site has no record, so nothing is predicted here. Simulate every step to see what the model does." };
     if (!chosen) return { text: "No fields are stored for this site.", actions: [this.run] };
     const { mesh, facts } = await loadMesh(this.context, `results/mesh/${chosen.source}/${encodeURIComponent(this.site.name)}`);
     if (this.sources.find((one) => one.source === this.source.value) !== chosen) return;

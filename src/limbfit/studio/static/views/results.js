@@ -62,7 +62,7 @@ class ResultsView {
     const sites = this.scene.sites.flatMap((site) => (site.records.length ? site.records.map((name) => ({ ...site, name })) : [site]));
     this.indentations = sites;
     replace(this.site, ...sites.map((site) => el("option", { value: site.name }, [site.name, site.region, site.fitted ? "fitted" : "held out"].filter(Boolean).join(", "))));
-    if (!sites.some((site) => site.name === this.chosen)) this.chosen = sites[0]?.name ?? null;
+    if (!sites.some((site) => site.name === this.chosen)) this.chosen = (sites.find((site) => site.records.length) ?? sites[0])?.name ?? null;
     this.showRuns();
     if (this.chosen !== null) this.choose(this.chosen);
     else return { text: "The study names no sites." };
