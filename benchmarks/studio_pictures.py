@@ -23,21 +23,11 @@ from playwright.sync_api import sync_playwright
 from limbfit import load_study, make_phantom_study
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
-from browsing import PATIENCE_MS, WITH_WEBGL
+from browsing import PATIENCE_MS, WITH_WEBGL, drop
 from studio import start_server
 
 SIZE = {"width": 1280, "height": 860}
 WAIT_S = 3600.0
-
-
-def drop(page: Any, selector: str, *paths: Path) -> None:
-    """Drag files or folders onto an element, and drop them there."""
-    box = page.locator(selector).bounding_box()
-    at = {"x": box["x"] + box["width"] / 2, "y": box["y"] + box["height"] / 2}
-    data = {"items": [], "files": [str(path) for path in paths], "dragOperationsMask": 1}
-    session = page.context.new_cdp_session(page)
-    for kind in ("dragEnter", "dragOver", "drop"):
-        session.send("Input.dispatchDragEvent", {"type": kind, **at, "data": data})
 
 
 def wait_for(found: Callable[[], Any], page: Any) -> None:

@@ -117,3 +117,13 @@ def until(condition: Callable[[], Any], seconds: float = PATIENCE_MS / 1000) -> 
             return value
         time.sleep(0.1)
     raise AssertionError("did not come true in time")
+
+
+def drop(page: Any, selector: str, *paths: Path) -> None:
+    """Drag files or folders of this machine from outside onto an element, and drop them there."""
+    box = page.locator(selector).bounding_box()
+    at = {"x": box["x"] + box["width"] / 2, "y": box["y"] + box["height"] / 2}
+    data = {"items": [], "files": [str(path) for path in paths], "dragOperationsMask": 1}
+    session = page.context.new_cdp_session(page)
+    for kind in ("dragEnter", "dragOver", "drop"):
+        session.send("Input.dispatchDragEvent", {"type": kind, **at, "data": data})

@@ -9,20 +9,10 @@ import numpy as np
 import pytest
 from serving_here import serve_here as serve_here
 
-from browsing import serious_findings, until
+from browsing import drop, serious_findings, until
 from limbfit import StudyResults, load_study, make_phantom_study
 from limbfit.anatomy.surfaces.surfaces import load_anatomy
 from limbfit.study import Study
-
-
-def drop(page: Any, selector: str, *paths: Path) -> None:
-    """Drag files or folders of this machine from outside onto an element, and drop them there."""
-    box = page.locator(selector).bounding_box()
-    at = {"x": box["x"] + box["width"] / 2, "y": box["y"] + box["height"] / 2}
-    data = {"items": [], "files": [str(path) for path in paths], "dragOperationsMask": 1}
-    session = page.context.new_cdp_session(page)
-    for kind in ("dragEnter", "dragOver", "drop"):
-        session.send("Input.dispatchDragEvent", {"type": kind, **at, "data": data})
 
 
 def place_site(page: Any, name: str, position: np.ndarray) -> None:
