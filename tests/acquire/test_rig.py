@@ -170,7 +170,7 @@ def test_a_stage_of_zabers_is_driven_and_each_of_its_hazards_ends_the_session(
     name: str, planned: Path, start: Start
 ) -> None:
     """Its library speaks to a process that answers in the protocol."""
-    pytest.importorskip("zaber_motion")
+    pytest.importorskip("zaber_motion", reason="zaber-motion is not installed (limbfit[zaber])")
     options, reason = ZABER_HAZARDS[name]
     file = start(zaber=1, **options)
     store_check(file, 1.0)
