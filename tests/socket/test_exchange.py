@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import pyvista
 from scipy.spatial.transform import Rotation
 from socket_limbs import CUT_NORMAL, revolved, round_limb
 
@@ -201,6 +202,20 @@ def test_distances_circumferences_and_volumes_of_balls(tmp_path: Path) -> None:
         around = [2 * np.pi * np.sqrt(radius**2 - (row.height_mm - 40.0) ** 2) for radius in radii]
         assert (row.first_mm, row.second_mm) == pytest.approx(around, rel=2e-3)
     assert compare_shapes(tmp_path / "42.vtp", tmp_path / "40.vtp").mean_mm == pytest.approx(-2.0, abs=0.02)
+
+
+def test_a_closed_limb_is_compared_with_an_open_socket_where_it_is_inside(tmp_path: Path, stl: Path) -> None:
+    write_surface(tmp_path / "limb.vtp", round_limb().skin)
+    found = compare_shapes(tmp_path / "limb.vtp", stl, map_file=tmp_path / "map.vtp")
+    back = compare_shapes(stl, tmp_path / "limb.vtp")
+    # The deepest area presses 4 mm inward; the end is 5 mm off, and so is the brim, measured from the limb.
+    assert 4.0 < found.max_mm < 6.0
+    assert 4.0 < back.max_mm < 6.0
+    assert found.rms_mm < 2.5
+    mapped = pyvista.read(tmp_path / "map.vtp")
+    left_out = np.isnan(mapped["distance_mm"])
+    assert left_out[mapped.points[:, 2] > 125.0].all()  # over the brim
+    assert not left_out[mapped.points[:, 2] < 80.0].any()
 
 
 def test_a_tape_spans_hollows() -> None:

@@ -233,23 +233,27 @@ def register_surface(moving: Surface, fixed: Surface) -> Surface:
 
 def measure_distances(here: Surface, there: Surface) -> tuple[Array, Array]:
     """Signed distance (n,) of another surface at the points of an outward one, mm, positive where it lies
-    outside, and the area (n,) of these points, mm2: 0 where what is nearest is at an open edge.
+    outside, and the area (n,) of these points, mm2.
+
+    NaN and 0 where what is nearest is an open edge or a fan across the opening: no surface lies opposite.
     """
-    squared, face, foot = there.find_nearest(here.points)
+    closed = close_by_fans(there)
+    squared, face, foot = closed.find_nearest(here.points)
     side = np.where(np.einsum("ij,ij->i", foot - here.points, here.vertex_normals) < 0.0, -1.0, 1.0)
-    at_edge = np.isin(there.faces[face], find_open_edges(there.faces)).any(axis=1)
-    return side * np.sqrt(squared), np.where(at_edge, 0.0, here.vertex_areas)
+    is_open = np.isin(closed.faces[face], find_open_edges(there.faces)).any(axis=1)
+    return np.where(is_open, np.nan, side * np.sqrt(squared)), np.where(is_open, 0.0, here.vertex_areas)
 
 
 def compare_surfaces(first: Surface, second: Surface, axis: Array) -> ShapeComparison:
     """Distances, measures, and circumferences of two outward surfaces, LPS mm, along a proximal axis (3,)."""
     one, another = measure_distances(first, second), measure_distances(second, first)
     distance, area = np.append(one[0], -another[0]), np.append(one[1], another[1])
+    distance, area = distance[area > 0.0], area[area > 0.0]
     if not area.any():
         raise SurfaceError("the two shapes do not face each other", remedy="add --register")
     return ShapeComparison(
         axis=axis,  # type: ignore[arg-type]
-        max_mm=np.abs(distance[area > 0.0]).max(),
+        max_mm=np.abs(distance).max(),
         rms_mm=np.sqrt(np.average(distance**2, weights=area)),
         mean_mm=np.average(distance, weights=area),
         compared_percent=100.0 * area.sum() / (first.area + second.area),
