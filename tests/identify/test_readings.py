@@ -1,10 +1,15 @@
 """Readings beside the records count in the fit as what they tell to first order."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from bars import PAPER, TRUTH, records, simulate
 
 from limbfit.identify.fit.parameters import Prior, Unknowns
 from limbfit.identify.fit.readings import LinearisedReadings, add_scatter
+from limbfit.identify.uncertainty.noise import estimate_curve_noise
+from limbfit.identify.uncertainty.uncertainty import estimate_uncertainty
 
 AT = np.log([5.0, 2.0, 0.5])
 
@@ -53,3 +58,20 @@ def test_what_a_simulation_lacks_is_a_mean_of_all_and_a_scatter_alike_among_neig
     assert near > 9.02
     off = 0.5 * random.normal(size=900)
     assert add_scatter(own, off - off.mean(), places, 10.0)[1] == pytest.approx(0.0, abs=1e-9)
+
+
+def test_readings_never_widen_what_the_records_say_and_good_ones_decide_it():
+    random = np.random.default_rng(5)
+    data = [
+        replace(one, force_N=one.force_N + 0.003 * random.normal(size=len(one.force_N))) for one in records()
+    ]
+    responses = simulate(TRUTH)
+    noise = estimate_curve_noise(responses, data)
+    sd, rows = [], random.normal(size=(2, len(TRUTH)))
+    for weight in (0.0, 1.0, 30.0, 1e3, 1e6):
+        readings = LinearisedReadings(weight * rows, weight * rows @ np.log(TRUTH))
+        known = estimate_uncertainty(TRUTH, responses, data, replace(PAPER, readings=readings), noise)
+        sd.append(np.sqrt(np.diag(known.about_centre)))
+    assert (np.diff(sd, axis=0) < 1e-12).all()
+    assert (sd[3] < 0.99 * sd[0]).any()
+    np.testing.assert_allclose(rows @ known.about_centre @ rows.T, 1e-12 * np.eye(2), rtol=1e-2, atol=1e-14)

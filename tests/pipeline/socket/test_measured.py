@@ -101,14 +101,22 @@ def test_cells_move_with_the_socket_and_average_the_pressure_over_their_area(tmp
     along = turn.apply(nodes) - nodes + move @ run.fit.frame
     strains = Strains(*(np.zeros(len(mesh.cells)) for _ in range(4)))
     slopes, at = np.array([0.3, 0.0, 0.2]), points - run.fit.pivot
-    for share, away, place in ((0.0, still, at), (1.0, along, at), (1.0, still, turn.apply(at) + move)):
+
+    def sample(share: float, away: np.ndarray, onto: np.ndarray | None = None) -> tuple:
         patch = Patch(0.0, 0.0, 0.0, 0.0)
         row = SocketStep(0.0, none, none, share * move, share * degrees, 0.0, 0.0, 0.0, patch, {})
         held = LoadedState(row, 20.0 + nodes @ slopes, still, away, strains, {})
-        found, _ = sample_pressure(run, held, points, np.full(len(points), 30.0))
-        off = found - (20.0 + place @ slopes)
+        return sample_pressure(run, held, points, np.full(len(points), 30.0), onto)
+
+    for share, away, place in ((0.0, still, at), (1.0, along, at), (1.0, still, turn.apply(at) + move)):
+        off = sample(share, away)[0] - (20.0 + place @ slopes)
         assert abs(np.median(off)) < 0.15
         assert np.percentile(np.abs(off), 90) < 1.0  # between facets; turned the other way it is 4
+    # Where a cell slides from facet to facet its pressure jumps, but not where it keeps to the first one.
+    for share in np.linspace(0.0, 1.0, 201):
+        _, below = sample(share, still)
+        before, after = (sample(share + step, still, below)[0] for step in (-1e-6, 1e-6))
+        np.testing.assert_allclose(after, before, atol=2e-5)
 
 
 def test_agreement_is_that_of_bland_and_altman_over_the_cells_that_are_compared():

@@ -96,11 +96,16 @@ def limit_slope(surface: Surface, values: Array, slope: float) -> Array:
 def transfer_values(surface: Surface, values: Array, points: Array) -> Array:
     """Values (k, n) at a surface's vertices, interpolated at the surface points nearest to points (m, 3)."""
     _, face, nearest = surface.find_nearest(points)
+    return interpolate_values(surface, values, face, nearest)
+
+
+def interpolate_values(surface: Surface, values: Array, face: Indices, points: Array) -> Array:
+    """Values (k, n) at a surface's vertices, linear over each face (m,) and beyond it, at points (m, 3)."""
     a, b, c = np.moveaxis(surface.triangles[face], 1, 0)
     normal = np.cross(b - a, c - a)
-    parts = [np.cross(c - b, nearest - b), np.cross(a - c, nearest - c), np.cross(b - a, nearest - a)]
+    parts = [np.cross(c - b, points - b), np.cross(a - c, points - c), np.cross(b - a, points - a)]
     share = np.stack([np.einsum("ij,ij->i", part, normal) for part in parts], axis=1)
-    share = np.maximum(share, np.finfo(float).tiny)
+    share += np.finfo(float).tiny  # a face without area gives a third to each corner
     share /= share.sum(axis=1, keepdims=True)
     return np.asarray(np.einsum("kmi,mi->km", values[:, surface.faces[face]], share))
 

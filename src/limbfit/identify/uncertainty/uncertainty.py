@@ -110,7 +110,8 @@ class _LinearisedEstimate:
     rest counts as one more deviation of the answer: its intervals must not say more than two readings of the
     same residuals agree on. ``about_centre`` (k, k) is without that. It is the covariance of the
     calibration's own estimator, which no details of the records make small, and it is larger than that of the
-    most probable parameters (Gauss and Markov).
+    most probable parameters (Gauss and Markov). Readings beside the records are not in the calibration's
+    cost: they are joined to its estimator with the weights of least variance, so it never knows less by them.
     """
 
     def __init__(
@@ -121,11 +122,13 @@ class _LinearisedEstimate:
         curvatures: Sequence[Array],
         prior_share: float,
         prior: PriorPrecision,
+        stated: int,
         model: ResidualModel,
         space: SearchSpace,
     ) -> None:
         """Linearise at z (k,) from residuals (n,), derivatives (n, k) N and the curvature (n, n) of
-        the cost per record; ``prior_share`` is the weight of the priors' squares in the cost.
+        the cost per record; ``prior_share`` is the weight of the priors' squares in the cost. The first
+        ``stated`` rows of ``prior`` are stated priors, the others readings.
         """
         precision, weighted = prior.weigh(jacobians, model)
         self.model, self.best = model, np.asarray(np.linalg.inv(precision), dtype=np.float64)
@@ -135,17 +138,19 @@ class _LinearisedEstimate:
         G = np.hstack(gradients)
         M = G @ model.covariance @ G.T
         H = G @ np.concatenate(jacobians)
-        of_priors = prior.rows.T @ prior.rows
+        of_priors, of_readings = (rows.T @ rows for rows in np.split(prior.rows, [stated]))
         # What the bounds say has no place in the estimator: it counts as beside records of the mean noise.
         spread = max(float(np.trace(M) / np.trace(H)), 1e-16 * float(np.trace(H)))
         inverse = np.linalg.inv((H + prior_share * of_priors) / spread + prior.bound_precision) / spread
-        self.by_records = inverse @ M @ inverse
         known_before = prior_share**2 * of_priors + spread**2 * prior.bound_precision
-        self.about_centre = self.by_records + inverse @ known_before @ inverse
+        alone = inverse @ (M + known_before) @ inverse
+        joined = np.eye(len(z)) + alone @ of_readings  # its inverse is the weight of the estimator alone
+        inverse, self.about_centre = np.linalg.solve(joined, inverse), np.linalg.solve(joined, alone)
+        self.by_records = inverse @ M @ inverse.T
         unexplained = _compute_unexplained(self.centre - z, self.about_centre - self.best)
         self.covariance = self.about_centre + unexplained
         of_misfit = sum(own @ model.misfit_covariance(i) @ own.T for i, own in enumerate(gradients))
-        self.by_misfit = inverse @ of_misfit @ inverse + unexplained
+        self.by_misfit = inverse @ of_misfit @ inverse.T + unexplained
         of_sites = inverse @ G @ np.concatenate(model.site_deviations)
         self.by_sites = of_sites @ of_sites.T
 
@@ -271,7 +276,8 @@ def estimate_uncertainty(
         one.compute_cost_curvature(settings.objective, r) for r, one in zip(residuals, measured, strict=True)
     ]
     share = (settings.force_error_percent / 100) ** 2
-    estimate = _LinearisedEstimate(z, residuals, scaled, curvatures, share, prior, model, space)
+    stated = len(unknowns.priors)
+    estimate = _LinearisedEstimate(z, residuals, scaled, curvatures, share, prior, stated, model, space)
 
     tie, middle = space.tie, space.to_logarithms(z)
     half, sd, freedom = estimate.judge(tie)
@@ -280,7 +286,7 @@ def estimate_uncertainty(
     axes = compute_principal_axes(covariance, space)
     half_of_axes, sd_of_axes, _ = estimate.judge(axes @ tie)
     share_of_prior, wider = prior.compute_shares(estimate.best, tie)
-    stated = prior.compute_deviations(z)
+    off = prior.compute_deviations(z)
     return Uncertainty(
         measured=tuple(measured),
         unknowns=unknowns,
@@ -300,7 +306,7 @@ def estimate_uncertainty(
         prior_share=share_of_prior,
         wider_without=wider,
         minus_2_log_evidence=model.criterion
-        + float(stated @ stated)
+        + float(off @ off)
         - float(np.linalg.slogdet(prior.precision)[1]),
     )
 

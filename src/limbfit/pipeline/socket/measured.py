@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 from ...anatomy.meshing.layers import build_liner_surface
 from ...anatomy.sites.markups import read_markups
 from ...anatomy.surfaces.surfaces import Anatomy
-from ...anatomy.surfaces.thickness import transfer_values
+from ...anatomy.surfaces.thickness import interpolate_values
 from ...anatomy.surfaces.triangles import Surface
 from ...arrays import Array, Indices
 from ...donning import DonningResult, LoadedState, extract_outer_surface
@@ -126,9 +126,10 @@ def compare_measured(
     for table in limb.study.socket.measured:
         recording, states, stretch = place_sensors(limb.study, table, run.face, limb.anatomy, limb.outer.skin)
         assert recording.position is not None
-        model, faces = sample_pressure(run, found.held[table.load], recording.position, recording.area_mm2)
+        model, below = sample_pressure(run, found.held[table.load], recording.position, recording.area_mm2)
         mean = recording.frames.mean(axis=0)
         rows = {row["region"]: row for row in held[table.load]["regions"]}
+        faces = below[:, 0] % len(run.mesh.face_sets[OUTER])  # of the mesh: its parts come one after another
         around = [sorted((n for n in sizes if run.faces[n][face]), key=sizes.__getitem__) for face in faces]
         columns = {
             "cell": recording.names,
@@ -173,13 +174,14 @@ def read_cells(run: SocketRun, found: DonningResult) -> CellReadings:
         chosen, held = np.array(states) == COMPARED, found.held[table.load]
         points, areas = recording.position[chosen], recording.area_mm2[chosen]
         measured = recording.frames.mean(axis=0)[chosen]
+        model, below = sample_pressure(run, held, points, areas)
         derivatives = np.zeros((len(points), len(own)))
         for i, name in enumerate(own):
             if name in names:  # fibres that a tissue has not change nothing
                 step = _STEP * np.eye(len(names))[names.index(name)]
-                ends = [sample_pressure(run, held.extrapolate(by), points, areas)[0] for by in (step, -step)]
+                near = [held.extrapolate(by) for by in (step, -step)]
+                ends = [sample_pressure(run, one, points, areas, below)[0] for one in near]
                 derivatives[:, i] = (ends[0] - ends[1]) / (2.0 * _STEP)
-        model, _ = sample_pressure(run, held, points, areas)
         # Of simulated pressures: a gain over measured ones would draw the answer to small pressures.
         gain = 0.01 * table.error_percent / NORMAL_95 * model
         alone = (table.error_kPa / NORMAL_95) ** 2 + (0.01 * table.error_percent / NORMAL_95 * measured) ** 2
@@ -198,24 +200,30 @@ def _scale_interval(value: float, rows: Sequence[Mapping[str, Any]]) -> list[flo
 
 
 def sample_pressure(
-    run: SocketRun, held: LoadedState, points: Array, area_mm2: Array
+    run: SocketRun, held: LoadedState, points: Array, area_mm2: Array, onto: Indices | None = None
 ) -> tuple[Array, Indices]:
-    """Mean pressure (n,) kPa over discs on the socket, and the face (n,) of the limb's mesh below each.
+    """Mean pressure (n,) kPa over discs on the socket, and the limb's triangles (n, d) below their points.
 
-    ``points`` (n, 3) are their middles where the socket is donned, with areas (n,).
+    ``points`` (n, 3) are their middles where the socket is donned, with areas (n,). ``onto``: triangles of an
+    earlier call, which the pressure is taken from again as if each went on beyond its edges. So pressures of
+    nearly the same state can be differentiated: the nearest triangle may change in between, and they jump.
     """
-    fit, outer, row = run.fit, run.mesh.face_sets[OUTER], held.row
-    turn = Rotation.from_rotvec(np.radians(row.turn) @ fit.frame)
-    surface = extract_outer_surface(run.mesh, held.displacement)
-    moved = fit.pivot + row.move @ fit.frame + turn.apply(points - fit.pivot)
-    _, face, foot = surface.find_nearest(moved)
-    normal = surface.face_normals[face]
+    fit, row, wall = run.fit, held.row, run.face.surface
+    normal = wall.face_normals[wall.find_nearest(points)[1]]
     along = np.cross(normal, np.eye(3)[np.abs(normal).argmin(axis=1)])
     along /= np.linalg.norm(along, axis=1, keepdims=True)
     across = DISC @ np.stack([along, np.cross(normal, along)], axis=1)
-    over = foot[:, None] + np.sqrt(area_mm2 / np.pi)[:, None, None] * across
-    values = transfer_values(surface, held.pressure[np.unique(outer)][None], over.reshape(-1, 3))[0]
-    return values.reshape(-1, len(DISC)) @ WEIGHTS, face % len(outer)
+    over = points[:, None] + np.sqrt(area_mm2 / np.pi)[:, None, None] * across
+    turn = Rotation.from_rotvec(np.radians(row.turn) @ fit.frame)
+    moved = fit.pivot + row.move @ fit.frame + turn.apply(over.reshape(-1, 3) - fit.pivot)
+    surface = extract_outer_surface(run.mesh, held.displacement)
+    if onto is None:
+        _, face, moved = surface.find_nearest(moved)
+    else:
+        face = onto.reshape(-1)
+    outer = np.unique(run.mesh.face_sets[OUTER])
+    values = interpolate_values(surface, held.pressure[outer][None], face, moved)[0]
+    return values.reshape(-1, len(DISC)) @ WEIGHTS, face.reshape(-1, len(DISC))
 
 
 def summarise_agreement(sensors: Sequence[SensorComparison]) -> list[PressureAgreement]:
