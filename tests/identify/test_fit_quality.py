@@ -21,6 +21,7 @@ FORCE = DEPTH**1.5
 SD, PEAK = 0.02, 8.0
 # White noise, and a site as a whole that may be 1 % stiffer.
 COVARIANCE = SD**2 * np.eye(81) + 1e-4 * np.outer(FORCE, FORCE)
+RIPPLES = compute_matern(TIMES, 0.07)
 SHAPE = np.stack([FORCE, DEPTH, DEPTH**2], axis=1)  # what three parameters would add, per logarithm
 
 
@@ -29,7 +30,8 @@ def assess(residual: np.ndarray, fitted: bool = True, inside: np.ndarray | None 
 
 
 def draw_noise(seed: int) -> np.ndarray:
-    return np.random.default_rng(seed).multivariate_normal(np.zeros(81), COVARIANCE)
+    # By Cholesky: the default's singular vectors, and with them the draws, differ from machine to machine.
+    return np.random.default_rng(seed).multivariate_normal(np.zeros(81), COVARIANCE, method="cholesky")
 
 
 def test_a_model_that_is_right_is_not_accused() -> None:
@@ -112,27 +114,30 @@ def test_a_record_on_another_mesh_is_no_fault_of_the_model() -> None:
 
     def make_error(seed: int) -> np.ndarray:
         random = np.random.default_rng(seed)
-        ripple = random.multivariate_normal(np.zeros(81), compute_matern(TIMES, 0.07)) * (DEPTH > 0)
+        ripple = random.multivariate_normal(np.zeros(81), RIPPLES, method="cholesky") * (DEPTH > 0)
         return 0.02 * FORCE * random.standard_normal() + 0.004 * PEAK * ripple
 
     def judge(covariances: list[np.ndarray], wrong: np.ndarray | float = 0.0) -> list[RecordFit]:
-        noise = np.random.default_rng(0).multivariate_normal(np.zeros(81), quiet, 4)
-        residuals = [one + make_error(100 + seed) + wrong for seed, one in enumerate(noise)]
+        noise = np.random.default_rng(draw).multivariate_normal(np.zeros(81), quiet, 4, method="cholesky")
+        residuals = [one + make_error(100 + 10 * draw + i) + wrong for i, one in enumerate(noise)]
         left = refit_residuals(residuals, [SHAPE] * 4, covariances)
         triples = zip(residuals, covariances, left, strict=True)
         return [assess_fit("05", True, TIMES, DEPTH, r, PEAK, C, None, after) for r, C, after in triples]
 
-    meshes = [make_error(seed) for seed in range(4)]
-    found = estimate_mesh_misfit(replace(model, mesh_N=meshes), [SHAPE] * 4, np.eye(3))
-    assert found is not None
-    assert 0.003 < found.share < 0.006
-    assert found.correlation <= 0.12
-    without = [quiet + np.outer(mesh, mesh) for mesh in meshes]
-    counted = [one + compute_mesh_covariance(found, TIMES, PEAK) for one in without]
-    assert any(one.verdict for one in judge(without))
-    assert not any(one.verdict for one in judge(counted))
-    assert max(one.times_noise for one in judge(counted)) < 1.3
     late = 0.05 * PEAK * np.clip(np.sin(np.pi * (TIMES - 8.0) / 2.0), 0.0, None) * (TIMES > 8.0)
-    assert any("the unloading" in one.verdict for one in judge(counted, late))
+    times_noise = []
+    for draw in range(8):
+        meshes = [make_error(1000 * draw + i) for i in range(4)]
+        found = estimate_mesh_misfit(replace(model, mesh_N=meshes), [SHAPE] * 4, np.eye(3))
+        assert found is not None
+        assert 0.003 < found.share < 0.007
+        assert found.correlation <= 0.12
+        without = [quiet + np.outer(mesh, mesh) for mesh in meshes]
+        counted = [one + compute_mesh_covariance(found, TIMES, PEAK) for one in without]
+        assert any(one.verdict for one in judge(without))
+        assert not any(one.verdict for one in judge(counted))
+        assert any("the unloading" in one.verdict for one in judge(counted, late))
+        times_noise += [one.times_noise for one in judge(counted)]
+    assert np.mean(times_noise) < 1.2
     quiet_mesh = replace(model, mesh_N=[0.0 * FORCE] * 4)
     assert estimate_mesh_misfit(quiet_mesh, [SHAPE] * 4, np.eye(3)) is None
