@@ -26,11 +26,25 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
+compiling: list[subprocess.Popen[bytes]] = []
+
+
 def pytest_sessionstart(session: pytest.Session) -> None:
     """After an installation one process compiles the kernels while tests are collected, not every worker."""
     if not hasattr(session.config, "workerinput") and not are_compiled():
         words = "from limbfit.fe.solution.compiling import compile_kernels; compile_kernels()"
-        subprocess.Popen([sys.executable, "-c", words])
+        compiling.append(subprocess.Popen([sys.executable, "-c", words]))
+
+
+def pytest_collection_finish() -> None:
+    """No test begins before: what a process compiles for itself differs in the last digits."""
+    for one in compiling:
+        one.wait()
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_node_collection_finished() -> None:
+    pytest_collection_finish()
 
 
 STUDY = """

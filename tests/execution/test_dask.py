@@ -117,7 +117,7 @@ position = {}
 
 
 @pytest.mark.slow
-def test_a_study_on_a_cluster_that_loses_a_worker_every_twenty_seconds_has_the_same_bits(study, tmp_path):
+def test_a_study_on_a_cluster_that_loses_a_worker_every_ten_seconds_has_the_same_bits(study, tmp_path):
     """Three workers, the study through ``--scheduler``; beside it the same study in one process."""
     more = SITES.format("3", [-40.0, 0.0, 60.0]) + SITES.format("4", [0.0, -40.0, 60.0])
     append(study, more + COARSE.replace("tet4", "tet10"))
@@ -134,7 +134,7 @@ def test_a_study_on_a_cluster_that_loses_a_worker_every_twenty_seconds_has_the_s
         with distributed.Client(cluster, set_as_default=False) as client:
             while True:
                 try:
-                    _, err = run.communicate(timeout=20.0)
+                    _, err = run.communicate(timeout=10.0)
                     break
                 except subprocess.TimeoutExpired:
                     workers = client.run(lambda dask_worker: (os.getpid(), len(dask_worker.state.executing)))

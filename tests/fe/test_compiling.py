@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -31,10 +32,34 @@ print(*made)
 """
 
 
+FEW = """
+import numpy as np
+import limbfit.fe
+from limbfit.shapes.shape import _rotate_about_axis
+
+_rotate_about_axis(np.ones((1, 3)), np.ones(1), np.ones((1, 2)), np.ones((1, 3)))
+"""
+
+
+def run_script(script: str, cache: Path) -> str:
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(cache)}
+    command = [sys.executable, "-c", script]
+    return subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout
+
+
 @pytest.mark.slow
 def test_an_indentation_compiles_nothing_more(tmp_path) -> None:
-    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
-    done = subprocess.run(
-        [sys.executable, "-c", SCRIPT], env=environment, capture_output=True, text=True, check=True
-    )
-    assert done.stdout.split() == []
+    assert run_script(SCRIPT, tmp_path).split() == []
+
+
+def test_a_kernel_that_is_older_than_the_source_of_another_is_compiled_anew(tmp_path) -> None:
+    run_script(FEW, tmp_path)
+    stored = list(tmp_path.rglob("*.nbi"))
+    assert stored
+    made = [file.stat().st_mtime for file in stored]
+    run_script(FEW, tmp_path)
+    assert [file.stat().st_mtime for file in stored] == made
+    for file in stored:
+        os.utime(file, (0.0, 0.0))
+    run_script("import limbfit.fe", tmp_path)
+    assert not any(file.exists() for file in stored)

@@ -1,8 +1,11 @@
 """The compiled kernels of an indentation: whether they are stored, and made beforehand."""
 
+import sys
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
+from numba.core.dispatcher import Dispatcher
 
 from ...mesh import Mesh, to_tet10
 from ...mesh.cells import SIX_TETS, build_boxes
@@ -18,6 +21,23 @@ from .sensitivity import explicit_derivatives
 from .stepping import solve
 
 _SIDE_MM, _DEPTH_MM = 20.0, 0.2
+
+
+def discard_old_kernels() -> None:
+    """Discard stored kernels that are older than the source of any other.
+
+    Numba compares a stored kernel with the file that it is written in. It does not see that a function which
+    the kernel calls has changed in another file, and would go on with the law or element as it was.
+    """
+    package = f"{__package__}".partition(".")[0] + "."
+    modules = [module for name, module in list(sys.modules.items()) if name.startswith(package)]
+    kernels = [one for module in modules for one in vars(module).values() if isinstance(one, Dispatcher)]
+    newest = max(Path(one.py_func.__code__.co_filename).stat().st_mtime for one in kernels)
+    for folder in {one.stats.cache_path for one in kernels if one.stats.cache_path}:
+        for file in Path(folder).glob("*.nbi"):
+            with suppress(FileNotFoundError):  # another process discards them, too
+                if file.stat().st_mtime < newest:
+                    file.unlink()
 
 
 def are_compiled() -> bool:
@@ -48,3 +68,6 @@ def compile_kernels() -> None:
         laws = Laws.build([tissue, tissue])
         compute_element_fields(found.system, laws, found.deepest)
         compute_elastic_stresses(found.system, laws, found.deepest.u)  # of steps without derivatives
+
+
+discard_old_kernels()  # before any of them is called
