@@ -150,7 +150,7 @@ def measure_tissue_under(anatomy: Anatomy, position: ArrayLike, axis: ArrayLike,
     for bone in anatomy.bones.values():
         hits = find_first_hits(bone)
         through = np.isfinite(hits) & np.isfinite(skin) & (hits > skin)
-        least = min(least, float((hits - skin)[through].min(initial=least)))
+        least = min(least, float((hits[through] - skin[through]).min(initial=least)))
     return least
 
 
