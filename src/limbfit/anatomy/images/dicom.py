@@ -204,8 +204,7 @@ def _check_kind(slices: Sequence[SliceHeader]) -> None:
         if header.modality not in _VOLUMES:
             kind = _redact_modality(header.modality) or "unknown"
             raise ImageError(
-                f"images of modality {kind} are not slices of a volume",
-                remedy="give an MR or CT series",
+                f"images of modality {kind} are not slices of a volume", remedy="give an MR or CT series"
             )
         if header.position is None or header.orientation is None or header.pixel_spacing is None:
             raise ImageError(

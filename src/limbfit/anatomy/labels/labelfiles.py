@@ -298,8 +298,7 @@ def find_dicom_labels(path: Path) -> Path | None:
         return None
     if _find_storage_class(path) is None:
         raise LabelError(
-            "DICOM, but no segmentation and no structure set",
-            remedy="give a DICOM-SEG or RTSTRUCT file",
+            "DICOM, but no segmentation and no structure set", remedy="give a DICOM-SEG or RTSTRUCT file"
         )
     return path
 

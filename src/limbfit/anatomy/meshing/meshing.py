@@ -163,11 +163,7 @@ def _has_neighbour(places: KDTree, distance_mm: float, points: Array) -> Mask:
 
 
 def mesh_site(
-    anatomy: Anatomy,
-    position: Array,
-    axis: Array,
-    settings: MeshSettings,
-    base: BaseMesh | None = None,
+    anatomy: Anatomy, position: Array, axis: Array, settings: MeshSettings, base: BaseMesh | None = None
 ) -> tuple[Mesh, MeshMeasures]:
     """A conforming mesh graded about an indentation site.
 

@@ -248,8 +248,7 @@ def _check_region(anatomy: Anatomy, region: Surface) -> None:
     points = region.points[anatomy.height(region.points) < 0.0]
     if not len(points):
         raise SurfaceError(
-            "the region lies wholly beyond the proximal cut",
-            remedy="leave it out or move the cut",
+            "the region lies wholly beyond the proximal cut", remedy="leave it out or move the cut"
         )
     outside = float(anatomy.skin.signed_distance(points).max())
     if outside > _OVERLAP_MM:

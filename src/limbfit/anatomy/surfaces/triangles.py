@@ -265,11 +265,7 @@ def number_components(edges: Indices, count: int) -> Indices:
 
 
 def check_closed(
-    surface: Surface,
-    name: str = "skin",
-    file: str | Path | None = None,
-    *,
-    smallest_mm: float | None = None,
+    surface: Surface, name: str = "skin", file: str | Path | None = None, *, smallest_mm: float | None = None
 ) -> None:
     """Refuse a surface that does not bound a body.
 
@@ -297,8 +293,7 @@ def check_closed(
         parts = len(find_bodies(surface))
         if parts > 1:
             raise SurfaceError(
-                f"{name}: {parts} separate bodies in one surface",
-                remedy="keep one closed body in each file",
+                f"{name}: {parts} separate bodies in one surface", remedy="keep one closed body in each file"
             )
         if surface.volume <= 0:
             raise SurfaceError(

@@ -29,8 +29,7 @@ def discard_old_kernels() -> None:
     Numba compares a stored kernel with the file that it is written in. It does not see that a function which
     the kernel calls has changed in another file, and would go on with the law or element as it was.
     """
-    package = f"{__package__}".partition(".")[0] + "."
-    modules = [module for name, module in list(sys.modules.items()) if name.startswith(package)]
+    modules = [module for name, module in list(sys.modules.items()) if name.startswith("limbfit.")]
     kernels = [one for module in modules for one in vars(module).values() if isinstance(one, Dispatcher)]
     newest = max(Path(one.py_func.__code__.co_filename).stat().st_mtime for one in kernels)
     for folder in {one.stats.cache_path for one in kernels if one.stats.cache_path}:
