@@ -23,8 +23,8 @@ from .stepping import solve
 _SIDE_MM, _DEPTH_MM = 20.0, 0.2
 
 
-def discard_old_kernels() -> None:
-    """Discard stored kernels that are older than the source of any other.
+def remove_old_kernels() -> None:
+    """Remove stored kernels that are older than the source of any other.
 
     Numba compares a stored kernel with the file that it is written in. It does not see that a function which
     the kernel calls has changed in another file, and would go on with the law or element as it was.
@@ -34,7 +34,7 @@ def discard_old_kernels() -> None:
     newest = max(Path(one.py_func.__code__.co_filename).stat().st_mtime for one in kernels)
     for folder in {one.stats.cache_path for one in kernels if one.stats.cache_path}:
         for file in Path(folder).glob("*.nbi"):
-            with suppress(FileNotFoundError):  # another process discards them, too
+            with suppress(FileNotFoundError):  # another process removes them, too
                 if file.stat().st_mtime < newest:
                     file.unlink()
 
@@ -69,4 +69,4 @@ def compile_kernels() -> None:
         compute_elastic_stresses(found.system, laws, found.deepest.u)  # of steps without derivatives
 
 
-discard_old_kernels()  # before any of them is called
+remove_old_kernels()  # before any of them is called
