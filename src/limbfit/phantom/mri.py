@@ -31,10 +31,7 @@ BIAS = 0.2
 FULL_SCALE, RESCALE_SLOPE = 1200.0, 0.5
 SLAB = 12
 REACH_MM = 85.0  # no tissue or marker lies further from the limb's axis
-DETAIL_GRIDS = {
-    "coarse": ((130, 76, 76), (2.36, 2.30, 2.00)),
-    "paper": ((256, 256, 256), (1.18, 1.15, 1.00)),
-}
+DETAIL_GRIDS = {"coarse": ((130, 76, 76), (2.36, 2.30, 2.00)), "paper": ((256, 256, 256), (1.18, 1.15, 1.00))}
 LABELS_FILE = Path("labels") / "labels.seg.nrrd"
 TENDON_LABEL, TENDON_VALUE = "patellar tendon", 7
 

@@ -96,16 +96,21 @@ def limit_slope(surface: Surface, values: Array, slope: float) -> Array:
 def transfer_values(surface: Surface, values: Array, points: Array) -> Array:
     """Values (k, n) at a surface's vertices, interpolated at the surface points nearest to points (m, 3)."""
     _, face, nearest = surface.find_nearest(points)
-    return interpolate_values(surface, values, face, nearest)
+    return interpolate_values(surface, values, face, nearest, np.finfo(float).tiny)
 
 
-def interpolate_values(surface: Surface, values: Array, face: Indices, points: Array) -> Array:
-    """Values (k, n) at a surface's vertices, linear over each face (m,) and beyond it, at points (m, 3)."""
+def interpolate_values(
+    surface: Surface, values: Array, face: Indices, points: Array, least: float = -np.inf
+) -> Array:
+    """Values (k, n) at a surface's vertices, linear over each face (m,) and beyond it, at points (m, 3).
+
+    ``least``: of each corner's share; a small positive one keeps to the face, which may have no area.
+    """
     a, b, c = np.moveaxis(surface.triangles[face], 1, 0)
     normal = np.cross(b - a, c - a)
     parts = [np.cross(c - b, points - b), np.cross(a - c, points - c), np.cross(b - a, points - a)]
     share = np.stack([np.einsum("ij,ij->i", part, normal) for part in parts], axis=1)
-    share += np.finfo(float).tiny  # a face without area gives a third to each corner
+    share = np.maximum(share, least)
     share /= share.sum(axis=1, keepdims=True)
     return np.asarray(np.einsum("kmi,mi->km", values[:, surface.faces[face]], share))
 
