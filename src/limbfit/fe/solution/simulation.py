@@ -126,7 +126,7 @@ class SteppedRun:
                 return
             t = pace.next_time(now, targets[0])
             before = self.counts["newton_iterations"]
-            with _limit_numpy_threads():
+            with limit_numpy_threads():
                 found = self._attempt(t, pace.patience)
             if isinstance(found, str):
                 self.counts["cuts"] += 1
@@ -171,7 +171,7 @@ class SteppedRun:
             self.floor = max(self.floor, 1e-2 * float(np.linalg.norm(strained)))  # no stress may be left
         elif not self.problem.acts_at_once:
             return True
-        with _limit_numpy_threads():
+        with limit_numpy_threads():
             found = self._attempt(0.0, self.pace.usual * PATIENCE, takes)
         if isinstance(found, str):
             self.reason = f"the {what} found no equilibrium: {found}"
@@ -409,7 +409,7 @@ class SteppedRun:
         return du, at.force * d_penalty + d_reaction + d_force
 
 
-def _limit_numpy_threads() -> AbstractContextManager[object]:
+def limit_numpy_threads() -> AbstractContextManager[object]:
     """While this lasts, NumPy's own linear algebra runs on one thread.
 
     Its arrays are small here, and its idle threads would spin on the cores that the solver works on.

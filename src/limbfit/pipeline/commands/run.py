@@ -13,6 +13,7 @@ from ..._version import __version__
 from ...errors import InputError, LimbfitError, RunError
 from ...execution import make_executor, run_in_background, share_executor
 from ...fe import are_compiled, compile_kernels
+from ...fe.solution.simulation import limit_numpy_threads
 from ...results.identification import CalibrationResult, PredictResult
 from ...results.runs import ExperimentRecord, MachineFacts, RunResult, StageRecord, StudyName
 from ...results.uncertainty import ModelsResult
@@ -328,8 +329,9 @@ def run_experiment(
 
 @contextmanager
 def _open_run(study: Study, what: str, listener: Listener) -> Iterator[Context]:
-    """Hold a study for a run, which is logged."""
+    """Hold a study for a run, which is logged; NumPy's threads are one, or the last digits depend on them."""
     with (
+        limit_numpy_threads(),
         lock(study.results),
         write_journal(study, what, listener) as listener,
         build_executor(study) as executor,
