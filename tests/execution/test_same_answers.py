@@ -1,5 +1,9 @@
 """A simulation's answer depends on its job alone: not on the order, the executor or the number of workers."""
 
+import os
+import shutil
+import subprocess
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -81,3 +85,22 @@ def test_executors_and_numbers_of_workers_give_the_same_bits(jobs):
         found.append(list(executor.map(simulate, jobs[::-1]))[::-1])
     for other in found[1:]:
         assert_equal(other, found[0])
+
+
+def test_records_are_the_same_bits_whatever_number_of_threads_numpy_is_given(study, tmp_path):
+    for file in (study / "1.csv", study / "2.csv"):  # as long as real ones
+        header, short = file.read_text().splitlines()[0], np.loadtxt(file, delimiter=",", skiprows=1).T
+        times = np.linspace(short[0][0], short[0][-1], 5000)
+        rows = [np.interp(times, short[0], row) for row in short]
+        rows[-1] += 0.01 * np.random.default_rng(0).normal(size=len(times))
+        np.savetxt(file, np.transpose(rows), delimiter=",", header=header, comments="")
+    found = []
+    for threads in ("1", "4"):
+        environment = os.environ | {"OPENBLAS_NUM_THREADS": threads, "OMP_NUM_THREADS": threads}
+        folder = shutil.copytree(study, tmp_path / threads)
+        command = [sys.executable, "-m", "limbfit", "run", str(folder), "--until", "traces"]
+        subprocess.run(command, env=environment, check=True, capture_output=True)
+        files = sorted((folder / "results" / "traces").glob("*.npy"))
+        assert files
+        found.append([file.read_bytes() for file in files])
+    assert found[0] == found[1]
