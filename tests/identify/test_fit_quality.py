@@ -125,19 +125,20 @@ def test_a_record_on_another_mesh_is_no_fault_of_the_model() -> None:
         return [assess_fit("05", True, TIMES, DEPTH, r, PEAK, C, None, after) for r, C, after in triples]
 
     late = 0.05 * PEAK * np.clip(np.sin(np.pi * (TIMES - 8.0) / 2.0), 0.0, None) * (TIMES > 8.0)
-    times_noise = []
+    shares, most = [], []
     for draw in range(8):
         meshes = [make_error(1000 * draw + i) for i in range(4)]
         found = estimate_mesh_misfit(replace(model, mesh_N=meshes), [SHAPE] * 4, np.eye(3))
         assert found is not None
-        assert 0.003 < found.share < 0.007
         assert found.correlation <= 0.12
         without = [quiet + np.outer(mesh, mesh) for mesh in meshes]
         counted = [one + compute_mesh_covariance(found, TIMES, PEAK) for one in without]
         assert any(one.verdict for one in judge(without))
         assert not any(one.verdict for one in judge(counted))
         assert any("the unloading" in one.verdict for one in judge(counted, late))
-        times_noise += [one.times_noise for one in judge(counted)]
-    assert np.mean(times_noise) < 1.2
+        shares.append(found.share)
+        most.append(max(one.times_noise for one in judge(counted)))
+    assert 0.003 < np.mean(shares) < 0.006
+    assert np.mean(most) < 1.3
     quiet_mesh = replace(model, mesh_N=[0.0 * FORCE] * 4)
     assert estimate_mesh_misfit(quiet_mesh, [SHAPE] * 4, np.eye(3)) is None

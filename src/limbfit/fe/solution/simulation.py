@@ -412,7 +412,7 @@ class SteppedRun:
 def limit_numpy_threads() -> AbstractContextManager[object]:
     """While this lasts, NumPy's own linear algebra runs on one thread.
 
-    Its arrays are small here, and its idle threads would spin on the cores that the solver works on.
+    Its idle threads would spin on the cores that the solver works on, and their number changes last digits.
     """
     return _find_openblas().limit(limits=1)
 

@@ -329,7 +329,7 @@ def run_experiment(
 
 @contextmanager
 def _open_run(study: Study, what: str, listener: Listener) -> Iterator[Context]:
-    """Hold a study for a run, which is logged; NumPy's threads are one, or the last digits depend on them."""
+    """Hold a study for a run, which is logged and has the same bits whatever number of threads there is."""
     with (
         limit_numpy_threads(),
         lock(study.results),
