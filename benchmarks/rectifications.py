@@ -155,7 +155,7 @@ def run(bench: Bench, seed: int, case: int) -> dict[str, Any]:
     except InputError as error:
         return row | {"outcome": "refused", "words": error.what}
     row["deepest_mm"] = float(socket.offset(limb.outer.skin).max())
-    donned = SocketRun("", limb, bench.mesh, choose_tissues(study)[0], socket)
+    donned = SocketRun("", limb.build_model(socket, bench.mesh), choose_tissues(study)[0])
     try:
         found = solve_run(donned, told)
     except RunError as error:
@@ -164,7 +164,7 @@ def run(bench: Bench, seed: int, case: int) -> dict[str, Any]:
             "words": str(error),
             "cpu_s": round(time.process_time() - started, 1),
         }
-    facts = summarise_run(donned, found)
+    facts = summarise_run(donned.model, found)
     (load,) = facts["loads"]
     return row | {
         "outcome": "completed",

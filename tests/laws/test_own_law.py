@@ -23,8 +23,7 @@ from limbfit.laws import FUNG, LAWS, Parameter, TissueLaw, register_law
 from limbfit.mesh import Mesh
 from limbfit.pipeline.commands.other_solvers import check_export
 from limbfit.pipeline.commands.run import compute_keys
-from limbfit.pipeline.engine.store import ResultFiles
-from limbfit.pipeline.socket.simulation import SocketLimb, SocketRun
+from limbfit.pipeline.socket.simulation import SocketLimb
 from limbfit.socket import Socket
 from small_limb import limb as limb_with_a_bone
 
@@ -200,19 +199,21 @@ def test_a_socket_knows_it_in_a_process_that_has_read_no_study_and_follows_its_f
     anatomy, mesh = limb_with_a_bone(), Mesh.from_arrays(np.eye(4, 3), [[0, 1, 2, 3]])
     mesh = replace(mesh, face_sets={"skin": np.array([[0, 1, 2]])})
     limb = SocketLimb(study, anatomy, anatomy, None, {}, ())
-    run = SocketRun("socket", limb, mesh, {"skin": TRUTH}, socket, ResultFiles(tmp_path / "runs"))
-    (tmp_path / "run.pickle").write_bytes(pickle.dumps(run))
-    code = "import pickle, sys; print(pickle.load(open(sys.argv[1], 'rb')).laws['skin'].parameters)"
+    model = limb.build_model(socket, mesh)
+    (tmp_path / "model.pickle").write_bytes(pickle.dumps(model))
+    code = f"""import pickle, sys
+model = pickle.load(open(sys.argv[1], "rb"))
+print(model.build_laws({{"skin": {TRUTH}}})["skin"].parameters)"""
     told = subprocess.run(
-        [sys.executable, "-c", code, tmp_path / "run.pickle"], capture_output=True, text=True, check=False
+        [sys.executable, "-c", code, tmp_path / "model.pickle"], capture_output=True, text=True, check=False
     )
-    assert told.stdout.strip() == str(run.laws["skin"].parameters), told.stderr
+    assert told.stdout.strip() == str(model.build_laws({"skin": TRUTH})["skin"].parameters), told.stderr
     shutil.copy(file, tmp_path / "yeoh.py")
     (tmp_path / "yeoh.py").write_text(file.read_text() + "# another thought\n")
     changed = study.model_copy(
         update={"study": study.study.model_copy(update={"extensions": (tmp_path / "yeoh.py",)})}
     )
-    assert replace(run, limb=replace(limb, study=changed)).key != run.key
+    assert replace(model, study=changed).digest != model.digest
 
 
 def test_an_export_of_the_exponential_law_is_refused_at_once(tmp_path):

@@ -1,4 +1,4 @@
-"""The limb in its socket: the experiments `socket` and `socket_design`."""
+"""The limb in its socket: the stage `sensors`, and the experiments `socket` and `socket_design`."""
 
 from collections.abc import Mapping, Sequence
 from typing import ClassVar
@@ -164,6 +164,37 @@ class SocketSamples(ResultPart):
 
     simulated: int = Field(description="Number of draws that came to their end.")
     failed: Sequence[str] = Field(description="Why others did not.")
+
+
+class PlacedCell(ResultPart):
+    """A cell of a sensor in the socket, and what it read."""
+
+    cell: str = Field(description="Its name; of a sheet, row and column.")
+    state: str = Field(description="`compared`, or why it is not, such as `dead` or `saturated`.")
+    position_mm: Vector = Field(description="Its place on the donned socket, LPS.")
+    area_mm2: float = Field(description="Its area.")
+    measured_kPa: float | None = Field(description="Mean of its readings; null: it has none.")
+
+
+class PlacedSensor(ResultPart):
+    """A recording of sensors whose cells are placed on the socket."""
+
+    name: str = Field(description="Name of the recording.")
+    load: str = Field(description="The load that it belongs to.")
+    error_kPa: float = Field(description="What 95 % of readings are within, and the percentage of them.")
+    error_percent: float = Field(description="Of a reading, that 95 % are within.")
+    stretch_percent: float | None = Field(description="How a sheet stretches over the face; null: no sheet.")
+    cells: Sequence[PlacedCell] = Field(description="Each cell.")
+
+
+class SensorsResult(StoredResult):
+    """Sensors in the socket whose pressures count in the calibration, and the limb's mesh in it."""
+
+    FILE: ClassVar = "sensors/sensors.json"
+
+    edge_mm: float = Field(description="Edge length of the limb's mesh under the socket.")
+    mesh: MeshMeasures = Field(description="The mesh of the whole limb.")
+    sensors: Sequence[PlacedSensor] = Field(description="Each recording.")
 
 
 class MeasuredCell(ResultPart):

@@ -13,7 +13,7 @@ from .limb import MeshResult, QualityResult, SegmentResult, SitesResult, Surface
 from .planning import DesignResult, ProtocolResult
 from .population import PopulationResult
 from .runs import CompareResult, RunResult, SimulateResult, StageStamp
-from .socket import SocketDesignResult, SocketResult
+from .socket import SensorsResult, SocketDesignResult, SocketResult
 from .uncertainty import CrossvalidateResult, ModelsResult, RegionsResult, SocketOfModels, UncertaintyResult
 
 R = TypeVar("R", bound=StoredResult)
@@ -57,6 +57,7 @@ class StudyResults:
     sites = OneFile(SitesResult)
     traces = OneFile(TracesResult)
     mesh = OneFile(MeshResult)
+    sensors = OneFile(SensorsResult)
     calibration = OneFile(CalibrationResult)
     predict = OneFile(PredictResult)
     uncertainty = OneFile(UncertaintyResult)

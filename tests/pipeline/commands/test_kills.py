@@ -16,8 +16,9 @@ import pytest
 
 from conftest import COARSE
 from editing import append
+from limbfit import load_study
 from limbfit.mesh import read_vtu
-from limbfit.pipeline.commands.run import STAGE_NAMES
+from limbfit.pipeline.commands.run import list_stages
 
 READERS = {
     ".json": lambda file: json.loads(file.read_text()),
@@ -49,7 +50,8 @@ def finish(folder: Path, workers: int) -> int:
 
 def finished(results: Path) -> dict[str, str]:
     """When each stage that stands in its place was done."""
-    files = {stage: results / stage / "stage.json" for stage in STAGE_NAMES}
+    stages = [stage.name for stage in list_stages(load_study(results.parent))]
+    files = {stage: results / stage / "stage.json" for stage in stages}
     return {stage: file.read_text() for stage, file in files.items() if file.is_file()}
 
 
@@ -98,7 +100,8 @@ def killed(folder: Path, after_lines: int, and_s: float, workers: int) -> str:
     run.communicate()
     assert group_is_empty(run.pid)
     done = finished(folder / "results")
-    return next((stage for stage in STAGE_NAMES[1:] if stage not in done), "done")
+    stages = [stage.name for stage in list_stages(load_study(folder))]
+    return next((stage for stage in stages[1:] if stage not in done), "done")
 
 
 @pytest.mark.slow

@@ -6,13 +6,11 @@ import numpy as np
 import pytest
 
 from limbfit import load_results, load_study, report_study, run_study
-from limbfit.anatomy.meshing.layers import build_liner_surface
 from limbfit.pipeline.commands.planning import choose_tissues
 from limbfit.pipeline.commands.simulate import simulate_site
-from limbfit.pipeline.socket.measured import CellReadings, read_cells
-from limbfit.pipeline.socket.sensors import write_true_sensors
-from limbfit.pipeline.socket.shape import build_loadable_socket, build_regions
-from limbfit.pipeline.socket.simulation import SocketLimb, SocketRun, solve_run
+from limbfit.pipeline.engine.store import Store
+from limbfit.pipeline.identification.pressures import PressureSimulator
+from limbfit.pipeline.socket.phantom_sensors import write_true_sensors
 from small_limb import limb, small_limb
 
 LOADED = """hold_s = 0.0
@@ -47,22 +45,17 @@ def write_record(curve: Path, file: Path) -> None:
 
 
 @pytest.mark.slow
-def test_pressures_of_cells_have_derivatives_with_respect_to_the_tissues(measured):
+def test_pressures_of_cells_have_derivatives_with_respect_to_the_tissues(measured, tmp_path):
     """Against simulations of other tissues, on a mesh so coarse that cells lose contact between them."""
-    study, anatomy = load_study(measured), limb()
-    at = study.vector(choose_tissues(study, True, None)[0])
-    outer, _ = build_liner_surface(anatomy, study.socket.liner.thickness_mm)
-    on = SocketLimb(study, anatomy, outer, None, build_regions(study, anatomy), ())
-    socket = build_loadable_socket(study, anatomy, outer.skin)
-    mesh, _ = on.mesh(measured, socket, lambda words: None)
-
-    def read(parameters: np.ndarray) -> CellReadings:
-        run = SocketRun("socket", on, mesh, study.by_tissue(parameters), socket, sensitivities=True)
-        return read_cells(run, solve_run(run, lambda time, end, words: None))
-
+    text = (measured / "study.toml").read_text()
+    (measured / "study.toml").write_text(f"{text}\n[calibration]\nuse_socket_pressures = true\n")
+    study = load_study(measured)
+    run_study(study, until="sensors")
+    at, store = study.vector(choose_tissues(study, True, None)[0]), Store(study.results)
+    simulator = PressureSimulator(study, store["sensors"], tmp_path / "kept", store["calibrate"], print)
     number = [f"{tissue}.{name}" for tissue, name in study.parameters].index("muscle.c_kPa")
     step = 0.03 * np.eye(len(at))[number]
-    here, less, more = (read(at * np.exp(by)) for by in (0.0 * step, -step, step))
+    here, less, more = (simulator.read_cells(at * np.exp(by), "here") for by in (0.0 * step, -step, step))
     expected, found = (less.off - more.off) / 0.06, here.derivatives[:, number]
     assert np.corrcoef(expected, found)[0, 1] > 0.95
     assert np.median(np.abs(found - expected)) < 0.03 * np.abs(expected).max()

@@ -7,16 +7,19 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from limbfit import fit_socket, load_study, report_study
+from limbfit import fit_socket, load_results, load_study, report_study, run_study, study_status
 from limbfit.cli.socket import show_socket
 from limbfit.donning import LoadedState, SocketStep, Strains
 from limbfit.donning.outcome import Patch
 from limbfit.errors import InputError
+from limbfit.mesh import read_vtu
 from limbfit.pipeline.commands.planning import choose_tissues
+from limbfit.pipeline.engine.context import Context, ignore_progress
+from limbfit.pipeline.engine.store import ResultFiles, Store
 from limbfit.pipeline.socket.measured import describe_measured, sample_pressure, summarise_agreement
-from limbfit.pipeline.socket.sensors import write_true_sensors
+from limbfit.pipeline.socket.phantom_sensors import write_true_sensors
 from limbfit.pipeline.socket.shape import build_regions, build_socket
-from limbfit.pipeline.socket.simulation import SocketLimb, SocketRun
+from limbfit.pipeline.socket.simulation import SocketLimb, SocketModel
 from limbfit.results.socket import MeasuredCell, SensorComparison, SocketResult
 from small_limb import limb, small_limb
 
@@ -92,21 +95,21 @@ def test_cells_move_with_the_socket_and_average_the_pressure_over_their_area(tmp
     run_limb = SocketLimb(study, anatomy, anatomy, None, build_regions(study, anatomy), ())
     socket = build_socket(study, anatomy, anatomy.skin)
     mesh, _ = run_limb.mesh(tmp_path, socket, lambda words: None)
-    run = SocketRun("socket", run_limb, mesh, {}, socket)
+    model = run_limb.build_model(socket, mesh)
     move, degrees, none = np.array([0.0, 0.0, 6.0]), np.array([0.0, 0.0, 10.0]), np.zeros(3)
     middles = mesh.points[mesh.face_sets["skin"][:, :3]].mean(axis=1)
     points = middles[socket.find_covered(middles)][::7]
-    nodes, still = mesh.points - run.fit.pivot, np.zeros_like(mesh.points)
+    nodes, still = mesh.points - model.fit.pivot, np.zeros_like(mesh.points)
     turn = Rotation.from_euler("z", 10.0, degrees=True)
-    along = turn.apply(nodes) - nodes + move @ run.fit.frame
+    along = turn.apply(nodes) - nodes + move @ model.fit.frame
     strains = Strains(*(np.zeros(len(mesh.cells)) for _ in range(4)))
-    slopes, at = np.array([0.3, 0.0, 0.2]), points - run.fit.pivot
+    slopes, at = np.array([0.3, 0.0, 0.2]), points - model.fit.pivot
 
     def sample(share: float, away: np.ndarray, onto: np.ndarray | None = None) -> tuple:
         patch = Patch(0.0, 0.0, 0.0, 0.0)
         row = SocketStep(0.0, none, none, share * move, share * degrees, 0.0, 0.0, 0.0, patch, {})
         held = LoadedState(row, 20.0 + nodes @ slopes, still, away, strains, {})
-        return sample_pressure(run, held, points, np.full(len(points), 30.0), onto)
+        return sample_pressure(model, held, points, np.full(len(points), 30.0), onto)
 
     for share, away, place in ((0.0, still, at), (1.0, along, at), (1.0, still, turn.apply(at) + move)):
         off = sample(share, away)[0] - (20.0 + place @ slopes)
@@ -117,6 +120,23 @@ def test_cells_move_with_the_socket_and_average_the_pressure_over_their_area(tmp
         _, below = sample(share, still)
         before, after = (sample(share + step, still, below)[0] for step in (-1e-6, 1e-6))
         np.testing.assert_allclose(after, before, atol=2e-5)
+
+
+def test_the_stage_sensors_stores_the_cells_and_the_limb_in_its_socket(tmp_path):
+    place_cell(tmp_path, f"{CELLS}[calibration]\nuse_socket_pressures = true\n")
+    study = load_study(tmp_path)
+    run_study(study, until="sensors")
+    (one,) = load_results(tmp_path).sensors.sensors
+    assert (one.name, one.load, one.error_percent) == ("one", "stance", 10.0)
+    (cell,) = one.cells
+    assert (cell.state, cell.area_mm2, cell.measured_kPa) == ("compared", 100.0, 25.0)
+    folder, context = study.results / "sensors", Context(study, Store(study.results), None, ignore_progress)
+    mesh, packed = read_vtu(folder / "limb.vtu"), ResultFiles(folder).find("model")
+    stored, drawn = SocketModel.unpack(study, mesh, packed), SocketLimb.from_context(context, "sensors")
+    socket = build_socket(study, drawn.anatomy, drawn.outer.skin)
+    assert stored.digest == drawn.build_model(socket, mesh).digest
+    np.testing.assert_array_equal(stored.fit.frame, drawn.build_model(socket, mesh).fit.frame)
+    assert "sensors" not in {row["stage"] for row in study_status(load_study(small_limb(tmp_path, BARE)))}
 
 
 def test_agreement_is_that_of_bland_and_altman_over_the_cells_that_are_compared():

@@ -183,10 +183,11 @@ def test_a_region_that_the_control_does_not_touch_has_no_percent_of_change(folde
         peaks = {"distal tibia": distal_kPa, NAMED: crest_kPa}
         rows = [LoadedRegion.model_construct(region=region, peak_kPa=peak) for region, peak in peaks.items()]
         state = SocketState.model_construct(regions=rows)
-        run = SocketRun(name, *[None] * 4)
+        run = SocketRun(name, None, {})
         return _Design(run, {}, SocketSimulation.model_construct(donning=state, loads=[]))
 
     designs = [press("control", 0.0, 90.0), press("design", 12.0, 60.0)]
-    _, found = _optimise_depths(context, None, designs, ["distal tibia", NAMED], 0, lambda done, words: None)
+    names = ["distal tibia", NAMED]
+    _, found = _optimise_depths(context, None, None, designs, names, 0, lambda done, words: None)
     changes = [RegionGain(**gain).change_percent for gain in found["gains"]]
     assert changes == [None, pytest.approx(-100.0 / 3.0)]

@@ -3,7 +3,7 @@
 import json
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from time import perf_counter
@@ -19,7 +19,7 @@ from ...results.runs import ExperimentRecord, MachineFacts, RunResult, StageReco
 from ...results.uncertainty import ModelsResult
 from ...study import Site, Study, load_study
 from ..engine.context import Context, Listener, Progress, build_executor, ignore_progress, write_journal
-from ..engine.digests import compute_file_digest
+from ..engine.digests import compute_file_digest, to_plain
 from ..engine.provenance import (
     Keys,
     Stage,
@@ -30,7 +30,7 @@ from ..engine.provenance import (
     describe_machine,
     record_settings,
 )
-from ..engine.store import Store, keep_hand_labels, lock, read_json, to_plain, write_result
+from ..engine.store import Store, keep_hand_labels, lock, read_json, write_result
 from ..identification.calibrate import check_calibrate, run_calibrate
 from ..identification.predict import run_predict
 from ..limb.mesh import run_mesh
@@ -41,7 +41,8 @@ from ..records.record_checks import choose_surface_points, tell_flags
 from ..records.secondary_measurements import read_motion
 from ..records.traces import run_traces
 from ..simulation.limb_geometry import LimbGeometry
-from .experiments import EXPERIMENTS, check_experiment, compute_experiment_key, list_experiment_states
+from ..socket.sensors import run_sensors
+from .experiments import EXPERIMENTS, SOCKET, check_experiment, compute_experiment_key, list_experiment_states
 from .report import run_report
 
 _PLACE = ("name", "position", "near", "axis", "edge", "region", "fitted", "indenter")
@@ -61,10 +62,11 @@ STAGES = (
     Stage(
         "mesh", run_mesh, ("surfaces", "sites"), ("geometry", "mesh", "clamps"), ("name",), apart=_NO_SHAPE
     ),
+    Stage("sensors", run_sensors, *SOCKET, apart=("socket.design", "socket.worn_s")),
     Stage(
         "calibrate",
         run_calibrate,
-        ("sites", "traces", "mesh"),
+        ("sites", "traces", "mesh", "sensors"),
         # It meshes once more, and does without a mesh that takes too long.
         ("material", "calibration", "solver", "indenter", "indenters", "clamps", "mesh"),
         ("name", "fitted", "weight", "edge", "indenter"),
@@ -80,16 +82,10 @@ _FOLDERS = frozenset(("compare", "export", "log", "models", "simulate", *STAGE_N
 def list_stages(study: Study) -> tuple[Stage, ...]:
     """The stages that a study has: without an image there is nothing to segment.
 
-    Where pressures in the socket count, the calibration reads what is said of the socket.
+    The sensors in its socket are placed where their pressures count in the calibration.
     """
-    stages = [stage for stage in STAGES if stage.name != "segment" or study.image is not None]
-    if not study.calibration.use_socket_pressures:
-        return tuple(stages)
-    apart = ("socket.design", "socket.worn_s")
-    return tuple(
-        replace(one, tables=(*one.tables, "socket"), apart=apart) if one.name == "calibrate" else one
-        for one in stages
-    )
+    left_out = {"segment": study.image is None, "sensors": not study.calibration.use_socket_pressures}
+    return tuple(stage for stage in STAGES if not left_out.get(stage.name))
 
 
 def compute_keys(study: Study, until: str = "report") -> dict[str, str]:

@@ -10,7 +10,7 @@ import hashlib
 import inspect
 import json
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -24,9 +24,16 @@ _LAZY = "_HOME"  # name of the table of an ``__init__`` that loads its names whe
 
 
 def compute_digest(*parts: Any) -> str:
-    """A short stable digest of JSON-like values."""
-    text = json.dumps(parts, sort_keys=True, default=str)
+    """A short stable digest of JSON-like values, and arrays."""
+    text = json.dumps(parts, sort_keys=True, default=to_plain)
     return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def to_plain(value: Any) -> Any:
+    """NumPy scalars and arrays, and collections such as ranges, as what JSON knows."""
+    if hasattr(value, "tolist"):
+        return value.tolist()
+    return list(value) if isinstance(value, Collection) else str(value)
 
 
 def find_data_files(path: Path) -> list[Path]:

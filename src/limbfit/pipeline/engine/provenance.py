@@ -83,7 +83,7 @@ def list_input_files(study: Study) -> dict[str, list[Path]]:
     files["indenters"] = [one.file for one in study.all_indenters.values() if one.file is not None]
     measured = [path for one in study.socket.measured for path in (one.file, one.markups)]
     files["socket"] = [path for path in (study.socket.file, *measured) if path is not None]
-    files["calibrate"] = files["socket"] if study.calibration.use_socket_pressures else []
+    files["sensors"] = files["socket"]
     files["traces"] += [path for record in study.recorded for path in record.files]
     return files
 

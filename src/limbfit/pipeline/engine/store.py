@@ -15,7 +15,7 @@ import json
 import os
 import shutil
 import uuid
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -33,7 +33,7 @@ from ...results.base import ResultPart
 from ...results.runs import StageStamp
 from ...results.study_results import StudyResults
 from ...study import Study
-from .digests import compute_file_digest
+from .digests import compute_file_digest, to_plain
 
 Facts = dict[str, Any]
 Arrays = Mapping[str, NDArray[np.float64]]
@@ -70,13 +70,6 @@ def write_result(path: Path, result: ResultPart) -> None:
 
 def read_json(path: Path) -> Any:
     return json.loads(path.read_text(encoding="utf-8"))
-
-
-def to_plain(value: Any) -> Any:
-    """NumPy scalars and arrays, and collections such as ranges, as what JSON knows."""
-    if hasattr(value, "tolist"):
-        return value.tolist()
-    return list(value) if isinstance(value, Collection) else str(value)
 
 
 @contextmanager

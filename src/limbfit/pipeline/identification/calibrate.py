@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -27,7 +28,7 @@ from ..simulation.limb_geometry import LimbGeometry
 from ..simulation.simulations import SimulationCache
 from ..socket.socket import check_socket
 from .answer import correct_answer, plan_coarser_meshes, sample_intervals
-from .pressures import count_pressures
+from .pressures import PressureSimulator, count_pressures
 from .search import (
     CalibrationProblem,
     RecordSimulator,
@@ -63,14 +64,14 @@ def run_calibrate(context: Context, folder: Path) -> None:
         wait()
     correction, pressures = correct_answer(simulator, starts.best, coarser), None
     if study.calibration.use_socket_pressures:
-        found, known, pressures = count_pressures(context, folder, simulator, starts.best, correction)
+        store = context.store
+        measured = PressureSimulator(study, store["sensors"], folder, store["calibrate"], report)
+        found, known, pressures = count_pressures(measured, simulator, starts.best, correction)
     else:
         found, known = sample_intervals(simulator, starts.best, correction)
     corrections = [_summarise_round(one, found.sites, problem) for one in rounds]
-    simulations = simulator.run_answer(found.parameters)
-    answers = {one.site: one for one in records.select_forces(simulations)}
-    warnings = {site: list(one.warnings) for site, one in answers.items() if one.warnings}
-    for site, texts in warnings.items():
+    at_answer = summarise_answer(simulator, found)
+    for site, texts in at_answer["warnings"].items():
         report(f"warning: site {site}, at the answer: {'; '.join(texts)}")
     bounds, kept = problem.unknowns, cache.load_all()
     content = stored.CalibrationResult(
@@ -88,16 +89,7 @@ def run_calibrate(context: Context, folder: Path) -> None:
         corrections=corrections,
         socket_pressures=pressures,
         multistart=_summarise_starts(starts, problem) if study.calibration.starts > 1 else None,
-        warnings=warnings,
-        contact=summarise_contact(
-            answers,
-            simulator.penalties,
-            records.select_forces(simulator.respond(simulations)),
-            records.select_forces(found.responses),
-        ),
-        doubts=summarise_doubts(
-            simulator.warnings, answers, simulator.evaluations * records.simulations, found
-        ),
+        **at_answer,
     )
     write_result(folder / "calibration.json", content)
 
@@ -208,6 +200,19 @@ def _summarise_priors(known: Uncertainty, study: Study) -> stored.PriorShares | 
         share=dict(zip(known.names, known.prior_share.tolist(), strict=True)),
         wider_without=dict(zip(known.names, known.wider_without.tolist(), strict=True)),
     )
+
+
+def summarise_answer(simulator: RecordSimulator, found: Calibration) -> dict[str, Any]:
+    """Simulate the answer, and summarise its ``warnings``, ``contact`` and ``doubts``, as they are stored."""
+    records, simulations = simulator.records, simulator.run_answer(found.parameters)
+    answers = {one.site: one for one in records.select_forces(simulations)}
+    rested, fitted = map(records.select_forces, (simulator.respond(simulations), found.responses))
+    count = simulator.evaluations * records.simulations
+    return {
+        "warnings": {site: list(one.warnings) for site, one in answers.items() if one.warnings},
+        "contact": summarise_contact(answers, simulator.penalties, rested, fitted),
+        "doubts": summarise_doubts(simulator.warnings, answers, count, found),
+    }
 
 
 def summarise_contact(

@@ -4,54 +4,145 @@ The socket is simulated at the answer with derivatives, and what is most probabl
 as they are to first order about it. That is repeated until it no longer moves what is compared.
 """
 
-from functools import partial
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
+from scipy.linalg import block_diag
 
+from ...arrays import Array
+from ...donning import DonningResult
+from ...errors import StudyError
 from ...identify.fit.calibration import Calibration
+from ...identify.fit.prediction import NORMAL_95
 from ...identify.fit.readings import LinearisedReadings, add_scatter
 from ...identify.uncertainty.uncertainty import Uncertainty
+from ...mesh import read_vtu
 from ...results.identification import PressureRound, SocketPressures
-from ..engine.context import Context
-from ..engine.digests import code_digest, compute_digest, compute_file_digest
+from ...results.socket import PlacedSensor, SensorsResult
+from ...socket.sensors import COMPARED
+from ...study import Study
+from ..engine.digests import code_digest, compute_digest
 from ..engine.store import RUNS, Made, ResultFiles
-from ..socket.measured import CellReadings, read_cells
-from ..socket.shape import build_loadable_socket, mesh_edge_mm
-from ..socket.simulation import SocketLimb, SocketRun, solve_run
+from ..socket.measured import sample_pressure
+from ..socket.sensors import MODEL
+from ..socket.simulation import MESH, SocketModel, SocketRun, solve_run
 from .answer import FineMeshCorrection, sample_intervals
-from .search import RecordSimulator
+from .search import RecordSimulator, Report
 
 FOLDER = "socket"
 MAX_ROUNDS = 4
+_STEP = 1e-4  # of a parameter's logarithm, for derivatives
+_READ = ("area_mm2", "measured_kPa")  # of a cell that is compared
 TOLERANCE_SD = 0.3  # of what all pressures together tell: it is enough that they move by less
 NOT_SETTLED = "the parameters still moved when the socket had been simulated as often as it may be"
 
 
+@dataclass(frozen=True, eq=False)
+class CellReadings:
+    """All cells of a study that can be compared with a simulation, whatever their recording.
+
+    ``position`` (n, 3) mm, ``off`` (n,) kPa: measured less simulated, the ``derivatives`` (n, p) of the
+    simulated ones with respect to the logarithms of the study's parameters, and the sensors' ``covariance``
+    (n, n). The stated percentage counts twice: for each cell, and for the gain of its whole recording.
+    """
+
+    position: Array
+    off: Array
+    derivatives: Array
+    covariance: Array
+
+
+@dataclass(frozen=True, eq=False)
+class PressureSimulator:
+    """Simulates the socket of a ``study`` as the stage ``sensors`` has stored it, and compares its pressures.
+
+    What was simulated is kept below ``folder``, that of the calibration; that of the one before, below
+    ``earlier``, is found too. ``report`` is given lines of progress.
+    """
+
+    study: Study
+    sensors: Path
+    folder: Path
+    earlier: Path
+    report: Report
+
+    @cached_property
+    def stored(self) -> SensorsResult:
+        """The cells on the socket, and what they read."""
+        return SensorsResult.read(self.sensors.parent)
+
+    @cached_property
+    def model(self) -> SocketModel:
+        """The limb in the socket."""
+        packed = ResultFiles(self.sensors).find(MODEL)
+        assert packed is not None
+        return SocketModel.unpack(self.study, read_vtu(self.sensors / MESH), packed)
+
+    @cached_property
+    def kept(self) -> ResultFiles:
+        """Simulations, by their keys."""
+        return ResultFiles(self.folder / FOLDER / RUNS, also=[self.earlier / FOLDER / RUNS])
+
+    def read_cells(self, parameters: Array, title: str) -> CellReadings:
+        """Simulate the socket with these parameters (p,), and compare; what was kept is not done again."""
+        run = SocketRun("calibrate", self.model, self.study.by_tissue(parameters), self.kept, True)
+        sensors = self.stored.sensors
+
+        def make() -> Made:
+            found = solve_run(run, lambda time, end, words: self.report(f"{title}: {words}"))
+            return {}, vars(compare_cells(self.model, sensors, found))
+
+        cells = [one.to_plain() for one in sensors]
+        _, arrays = self.kept.get(compute_digest(run.key, cells, code_digest(compare_cells)), make)
+        self.kept.drop(run.partial_key)
+        return CellReadings(**arrays)
+
+
+def compare_cells(model: SocketModel, sensors: Sequence[PlacedSensor], found: DonningResult) -> CellReadings:
+    """Compare sensors with a simulation that has sensitivities. Raises `StudyError` where no cell can be."""
+    study, names, parts = model.study, list(found.result.parameter_names), []
+    own = [(tissue, parameter.name) for tissue in study.tissues for parameter in study.law.parameters]
+    for sensor in sensors:
+        held, cells = found.held[sensor.load], [cell for cell in sensor.cells if cell.state == COMPARED]
+        points = np.array([cell.position_mm for cell in cells]).reshape(-1, 3)
+        areas, measured = (np.array([getattr(cell, key) for cell in cells]) for key in _READ)
+        simulated, below = sample_pressure(model, held, points, areas)
+        derivatives = np.zeros((len(points), len(own)))
+        for i, name in enumerate(own):
+            if name in names:  # fibres that a tissue has not change nothing
+                step = _STEP * np.eye(len(names))[names.index(name)]
+                near = [held.extrapolate(by) for by in (step, -step)]
+                ends = [sample_pressure(model, one, points, areas, below)[0] for one in near]
+                derivatives[:, i] = (ends[0] - ends[1]) / (2.0 * _STEP)
+        share, own_sd = 0.01 * sensor.error_percent / NORMAL_95, sensor.error_kPa / NORMAL_95
+        # Of simulated pressures: a gain over measured ones would draw the answer to small pressures.
+        gain, alone = share * simulated, own_sd**2 + (share * measured) ** 2
+        parts.append((points, measured - simulated, derivatives, np.diag(alone) + np.outer(gain, gain)))
+    positions, offs, slopes, covariances = zip(*parts, strict=True)
+    if not sum(map(len, offs)):
+        raise StudyError("no cell can be compared", file=study.file, place="socket.measured")
+    together = np.concatenate(positions), np.concatenate(offs), np.concatenate(slopes)
+    return CellReadings(*together, block_diag(*covariances))
+
+
 def count_pressures(
-    context: Context,
-    folder: Path,
+    pressures: PressureSimulator,
     simulator: RecordSimulator,
     answer: Calibration,
     correction: FineMeshCorrection,
 ) -> tuple[Calibration, Uncertainty, SocketPressures]:
     """Find what is most probable by records and pressures, from the ``answer`` to the records alone.
 
-    Returned are that, what is known of it, and what the pressures told. ``folder`` is the stage's own. The
-    simulator's problem counts the pressures from then on. Raises `RunError` where the socket cannot be
-    simulated.
+    Returned are that, what is known of it, and what the pressures told. The simulator's problem counts the
+    pressures from then on. Raises `RunError` where the socket cannot be simulated.
     """
-    study, tell = context.study, partial(context.tell, "calibrate", 0, 0)
-    limb = SocketLimb.from_context(context, "calibrate")
-    socket = build_loadable_socket(study, limb.anatomy, limb.outer.skin)
-    own, edge_mm = folder / FOLDER, mesh_edge_mm(study, socket)
-    kept = ResultFiles(own / RUNS, also=[context.store["calibrate"] / FOLDER / RUNS])
-    mesh, _ = limb.mesh(own, socket, tell)
     now, rounds = answer.parameters, list[PressureRound]()
     while True:
         title = f"socket, simulation {len(rounds) + 1}"
-        run = SocketRun("calibrate", limb, mesh, study.by_tissue(now), socket, kept, sensitivities=True)
-        cells = _simulate_cells(context, run, title)
+        cells, edge_mm = pressures.read_cells(now, title), pressures.stored.edge_mm
         covariance, scatter_kPa = add_scatter(cells.covariance, cells.off, cells.position, edge_mm)
         readings = LinearisedReadings.weigh(cells.off, cells.derivatives, covariance, np.log(now))
         simulator.count_readings(readings)
@@ -59,7 +150,7 @@ def count_pressures(
         moved = float(np.linalg.norm(readings.rows @ np.log(found.parameters / now)))
         rounds.append(
             PressureRound(
-                parameters=run.parameters,
+                parameters=pressures.study.by_tissue(now),
                 rms_kPa=float(np.sqrt(np.mean(cells.off**2))),
                 bias_kPa=-float(cells.off.mean()),
                 scatter_kPa=scatter_kPa,
@@ -67,12 +158,12 @@ def count_pressures(
             )
         )
         words = f"{len(cells.off)} cells off by {rounds[-1].rms_kPa:.1f} kPa (RMS)"
-        tell(f"{title}: {words}, then parameters that move them by {moved:.2f} deviations")
+        pressures.report(f"{title}: {words}, then parameters that move them by {moved:.2f} deviations")
         now, settled = found.parameters, moved < TOLERANCE_SD
         if settled or len(rounds) == MAX_ROUNDS:
             break
     if not settled:
-        tell(f"warning: {NOT_SETTLED}")
+        pressures.report(f"warning: {NOT_SETTLED}")
     content = SocketPressures(
         cells=len(cells.off),
         settled=settled,
@@ -83,20 +174,3 @@ def count_pressures(
         wider_without=dict(zip(known.names, known.wider_without.tolist(), strict=True)),
     )
     return found, known, content
-
-
-def _simulate_cells(context: Context, run: SocketRun, title: str) -> CellReadings:
-    """Simulate the socket and compare; what was kept is not done again."""
-    assert run.kept is not None
-    study = run.limb.study
-
-    def make() -> Made:
-        found = solve_run(run, lambda time, end, words: context.tell("calibrate", 0, 0, f"{title}: {words}"))
-        return {}, vars(read_cells(run, found))
-
-    tables = [one.model_dump(mode="json") for one in study.socket.measured]
-    files = [path for one in study.socket.measured for path in (one.file, one.markups) if path is not None]
-    digests = [compute_file_digest(study.path(file)) for file in files]
-    _, arrays = run.kept.get(compute_digest(run.key, tables, digests, code_digest(read_cells)), make)
-    run.kept.drop(run.partial_key)
-    return CellReadings(**arrays)

@@ -99,23 +99,25 @@ def run_socket_design(
         plain, face = build_undeformed_socket(study, limb.anatomy, limb.outer.skin, optimise)
         mesh, facts = limb.mesh(folder, face, partial(context.tell, NAME, 0, 0))
         kept = ResultFiles(folder / RUNS, also=[context.store[NAME] / RUNS])
-        unloaded = SocketRun("", limb, mesh, parameters, face, kept)
-        recipe = _compute_pressed_recipe(unloaded, plain, target, tell)
+        unloaded = SocketRun("", limb.build_model(face, mesh), parameters, kept)
+        recipe = _compute_pressed_recipe(limb, unloaded, plain, target, tell)
         designed = _build_face(limb, recipe, {})
         reduced, percent = reduce_to_volume(designed.volume_mm3, limb.outer.skin, limb.anatomy.frame, plain)
-        control = _Design(replace(unloaded, name=CONTROL, face=reduced), {"reduction_percent": percent})
-        design = _Design(replace(unloaded, name=DESIGN, face=designed), {"depths_mm": {}})
+        model = limb.build_model(reduced, mesh)
+        control = _Design(replace(unloaded, name=CONTROL, model=model), {"reduction_percent": percent})
+        model = limb.build_model(designed, mesh)
+        design = _Design(replace(unloaded, name=DESIGN, model=model), {"depths_mm": {}})
         designs, found = _solve_designs([control, design], context.executor, tell, 1), None
         if optimise:
-            best, found = _optimise_depths(context, recipe, designs, optimise, simulations, tell)
+            best, found = _optimise_depths(context, limb, recipe, designs, optimise, simulations, tell)
             designs.append(best)
     last = designs[-1].run
-    walled = shape.build_socket_wall(study, limb.anatomy, last.face)
+    walled = shape.build_socket_wall(study, limb.anatomy, last.model.face)
     write_surface(folder / "socket.stl", walled)
-    thickness = measure_thickness(walled, last.face)
+    thickness = measure_thickness(walled, last.model.face)
     content = {
         "target": {"pressure": target.kind, "pressure_kPa": target.pressure_kPa, "regions": target.regions},
-        "designs": [_summarise_design(one) for one in designs],
+        "designs": [_summarise_design(limb, one) for one in designs],
         "optimisation": found,
         "wall": {
             "of": last.name,
@@ -124,7 +126,7 @@ def run_socket_design(
             "median_mm": np.median(thickness),
             "volume_cm3": walled.volume / 1000.0,
         },
-        "shop": write_shop_package(folder, limb, last.face, walled),
+        "shop": write_shop_package(folder, limb, last.model.face, walled),
         "parameters": parameters,
         "parameters_from": parameters_from,
         "liner": limb.liner,
@@ -134,7 +136,7 @@ def run_socket_design(
     result = SocketDesignResult.model_validate(content)
     write_result(folder / f"{NAME}.json", result)
     for one in designs:
-        _write_fields(folder, one)
+        _write_fields(folder, limb, one)
     _write_tables(folder, result)
 
 
@@ -163,14 +165,17 @@ class _Design:
         return peaks
 
 
-def _compute_pressed_recipe(unloaded: SocketRun, plain: Recipe, target: Target, tell: Tell) -> Recipe:
+def _compute_pressed_recipe(
+    limb: SocketLimb, unloaded: SocketRun, plain: Recipe, target: Target, tell: Tell
+) -> Recipe:
     """How the limb's shape becomes that under the target pressure."""
-    limb, mesh, kept = unloaded.limb, unloaded.mesh, unloaded.kept
+    model, mesh, kept = unloaded.model, unloaded.model.mesh, unloaded.kept
     assert kept is not None
     table, middles = limb.study.socket, mesh.points[mesh.face_sets[OUTER][:, :3]].mean(axis=1)
-    pressure = target.at(middles, limb.anatomy, limb.regions, unloaded.face)
-    problem = build_pressed_problem(mesh, unloaded.laws, pressure, table.donning_s, table.hold_s)
-    problem = replace(problem, fibres=build_fibre_field(limb.fibres, mesh))
+    pressure = target.at(middles, limb.anatomy, limb.regions, model.face)
+    laws = model.build_laws(unloaded.parameters)
+    problem = build_pressed_problem(mesh, laws, pressure, table.donning_s, table.hold_s)
+    problem = replace(problem, fibres=build_fibre_field(model.fibres, mesh))
     end = problem.history.times[-1]
 
     def make() -> Made:
@@ -215,11 +220,12 @@ def _solve_designs(designs: Sequence[_Design], executor: Executor, tell: Tell, b
     return solved
 
 
-def _summarise_design(one: _Design) -> dict[str, Any]:
-    offset = -one.run.face.offset(one.run.limb.outer.skin)
+def _summarise_design(limb: SocketLimb, one: _Design) -> dict[str, Any]:
+    face = one.run.model.face
+    offset = -face.offset(limb.outer.skin)
     return {
         "name": one.run.name,
-        "volume_cm3": one.run.face.volume_mm3 / 1000.0,
+        "volume_cm3": face.volume_mm3 / 1000.0,
         "offset_mm": [offset.min(), offset.max()],
         "peaks_kPa": one.peaks,
         **one.made,
@@ -227,19 +233,20 @@ def _summarise_design(one: _Design) -> dict[str, Any]:
     }
 
 
-def _write_fields(folder: Path, one: _Design) -> None:
+def _write_fields(folder: Path, limb: SocketLimb, one: _Design) -> None:
     """The face, and the fields after donning and each load."""
     run = one.run
-    run.write_face(folder / f"{run.name}-face.vtp")
+    limb.write_face(run.model.face, folder / f"{run.name}-face.vtp")
     names = dict.fromkeys(key.rpartition(".")[0] for key in one.fields)
     for i, name in enumerate(names):
         data = {"pressure_kPa": one.fields[f"{name}.pressure"], "shear_kPa": one.fields[f"{name}.shear"]}
         data["displacement_mm"] = one.fields[f"{name}.displacement"]
-        write_vtu(run.mesh, folder / f"{run.name}-{i}.vtu", point_data=data)
+        write_vtu(run.model.mesh, folder / f"{run.name}-{i}.vtu", point_data=data)
 
 
 def _optimise_depths(
     context: Context,
+    limb: SocketLimb,
     recipe: Recipe,
     designs: Sequence[_Design],
     optimise: Sequence[str],
@@ -269,8 +276,8 @@ def _optimise_depths(
         depths = dict(zip(optimise, map(float, proposed), strict=True))
         name, before = f"{OPTIMISED}, {number}", 2 + number
         try:
-            face = _build_face(best.run.limb, recipe, depths)
-            tried = _Design(replace(best.run, name=name, face=face), {"depths_mm": depths})
+            model = limb.build_model(_build_face(limb, recipe, depths), best.run.model.mesh)
+            tried = _Design(replace(best.run, name=name, model=model), {"depths_mm": depths})
             (made,) = _solve_designs([tried], context.executor, tell, before)
         except (SurfaceError, RunError) as error:
             tell(before + 1.0, f"{name}: {error}")

@@ -10,12 +10,11 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
 from ...anatomy.meshing.layers import build_liner_surface
@@ -37,14 +36,13 @@ from ...study import Study
 from ...study.socket import MeasuredTable
 from ..simulation.loading import LimbAxis
 from .shape import build_socket, place_errors
-from .simulation import SocketRun
+from .simulation import SocketLimb, SocketModel
 
 OFF, ALL = "off the socket", "all"  # a cell that the face does not reach, and cells of any region
 # Points of a disc of radius 1, and their weights: exact to the fifth order (Abramowitz and Stegun, 25.4.61).
 _TURNS = np.radians(60.0 * np.arange(6))
 DISC = np.vstack([[0.0, 0.0], np.sqrt(2.0 / 3.0) * np.column_stack([np.cos(_TURNS), np.sin(_TURNS)])])
 WEIGHTS = np.array([1 / 4, *[1 / 8] * 6])
-_STEP = 1e-4  # of a parameter's logarithm, for derivatives
 
 
 def read_sensors(study: Study, table: MeasuredTable) -> SensorFrames:
@@ -117,20 +115,26 @@ def _build_outer_surface(anatomy: Anatomy, liner_mm: float) -> Surface:
 
 
 def compare_measured(
-    run: SocketRun, found: DonningResult, content: Mapping[str, Any]
+    limb: SocketLimb, model: SocketModel, found: DonningResult, content: Mapping[str, Any]
 ) -> tuple[list[SensorComparison], list[PressureAgreement]]:
     """Compare every recording of a study with a simulation, whose intervals are those of its ``content``."""
-    limb, axis, sensors = run.limb, LimbAxis(run.limb.anatomy), []
+    axis, sensors = LimbAxis(limb.anatomy), []
     held = {one["name"]: one for one in content["loads"]} | {"donning": content["donning"]}
-    sizes = {name: mask.sum() for name, mask in run.faces.items()}
+    sizes = {name: mask.sum() for name, mask in model.faces.items()}
     for table in limb.study.socket.measured:
-        recording, states, stretch = place_sensors(limb.study, table, run.face, limb.anatomy, limb.outer.skin)
+        recording, states, stretch = place_sensors(
+            limb.study, table, model.face, limb.anatomy, limb.outer.skin
+        )
         assert recording.position is not None
-        model, below = sample_pressure(run, found.held[table.load], recording.position, recording.area_mm2)
+        simulated, below = sample_pressure(
+            model, found.held[table.load], recording.position, recording.area_mm2
+        )
         mean = recording.frames.mean(axis=0)
         rows = {row["region"]: row for row in held[table.load]["regions"]}
-        faces = below[:, 0] % len(run.mesh.face_sets[OUTER])  # of the mesh: its parts come one after another
-        around = [sorted((n for n in sizes if run.faces[n][face]), key=sizes.__getitem__) for face in faces]
+        faces = below[:, 0] % len(
+            model.mesh.face_sets[OUTER]
+        )  # of the mesh: its parts come one after another
+        around = [sorted((n for n in sizes if model.faces[n][face]), key=sizes.__getitem__) for face in faces]
         columns = {
             "cell": recording.names,
             "state": states,
@@ -140,57 +144,15 @@ def compare_measured(
             "angle_deg": axis.measure_angle(recording.position),
             "measured_kPa": [value if np.isfinite(value) else None for value in mean.tolist()],
             "error_kPa": np.hypot(table.error_kPa, 0.01 * table.error_percent * np.nan_to_num(mean)),
-            "model_kPa": model,
-            "interval_kPa": [_scale_interval(p, [rows[n] for n in names]) for p, names in zip(model, around)],
+            "model_kPa": simulated,
+            "interval_kPa": [
+                _scale_interval(p, [rows[n] for n in names]) for p, names in zip(simulated, around)
+            ],
         }
         named = {"name": table.name, "load": table.load, "stretch_percent": stretch}
         cells = [dict(zip(columns, values)) for values in zip(*columns.values(), strict=True)]
         sensors.append(SensorComparison.model_validate({**named, "counts": Counter(states), "cells": cells}))
     return sensors, summarise_agreement(sensors)
-
-
-@dataclass(frozen=True, eq=False)
-class CellReadings:
-    """All cells of a study that can be compared with a simulation, whatever their recording.
-
-    ``position`` (n, 3) mm, ``off`` (n,) kPa: measured less simulated, the ``derivatives`` (n, p) of the
-    simulated ones with respect to the logarithms of the study's parameters, and the sensors' ``covariance``
-    (n, n). The stated percentage counts twice: for each cell, and for the gain of its whole recording.
-    """
-
-    position: Array
-    off: Array
-    derivatives: Array
-    covariance: Array
-
-
-def read_cells(run: SocketRun, found: DonningResult) -> CellReadings:
-    """Compare with a simulation that has sensitivities. Errors as `place_sensors`; no cell may be left."""
-    study, names, parts = run.limb.study, list(found.result.parameter_names), []
-    own = [(tissue, parameter.name) for tissue in study.tissues for parameter in study.law.parameters]
-    for table in study.socket.measured:
-        recording, states, _ = place_sensors(study, table, run.face, run.limb.anatomy, run.limb.outer.skin)
-        assert recording.position is not None
-        chosen, held = np.array(states) == COMPARED, found.held[table.load]
-        points, areas = recording.position[chosen], recording.area_mm2[chosen]
-        measured = recording.frames.mean(axis=0)[chosen]
-        model, below = sample_pressure(run, held, points, areas)
-        derivatives = np.zeros((len(points), len(own)))
-        for i, name in enumerate(own):
-            if name in names:  # fibres that a tissue has not change nothing
-                step = _STEP * np.eye(len(names))[names.index(name)]
-                near = [held.extrapolate(by) for by in (step, -step)]
-                ends = [sample_pressure(run, one, points, areas, below)[0] for one in near]
-                derivatives[:, i] = (ends[0] - ends[1]) / (2.0 * _STEP)
-        # Of simulated pressures: a gain over measured ones would draw the answer to small pressures.
-        gain = 0.01 * table.error_percent / NORMAL_95 * model
-        alone = (table.error_kPa / NORMAL_95) ** 2 + (0.01 * table.error_percent / NORMAL_95 * measured) ** 2
-        parts.append((points, measured - model, derivatives, np.diag(alone) + np.outer(gain, gain)))
-    positions, offs, slopes, covariances = zip(*parts, strict=True)
-    if not sum(map(len, offs)):
-        raise StudyError("no cell can be compared", file=study.file, place="socket.measured")
-    together = np.concatenate(positions), np.concatenate(offs), np.concatenate(slopes)
-    return CellReadings(*together, block_diag(*covariances))
 
 
 def _scale_interval(value: float, rows: Sequence[Mapping[str, Any]]) -> list[float] | None:
@@ -200,7 +162,7 @@ def _scale_interval(value: float, rows: Sequence[Mapping[str, Any]]) -> list[flo
 
 
 def sample_pressure(
-    run: SocketRun, held: LoadedState, points: Array, area_mm2: Array, onto: Indices | None = None
+    model: SocketModel, held: LoadedState, points: Array, area_mm2: Array, onto: Indices | None = None
 ) -> tuple[Array, Indices]:
     """Mean pressure (n,) kPa over discs on the socket, and the limb's triangles (n, d) below their points.
 
@@ -208,7 +170,7 @@ def sample_pressure(
     earlier call, which the pressure is taken from again as if each went on beyond its edges. So pressures of
     nearly the same state can be differentiated: the nearest triangle may change in between, and they jump.
     """
-    fit, row, wall = run.fit, held.row, run.face.surface
+    fit, row, wall = model.fit, held.row, model.face.surface
     normal = wall.face_normals[wall.find_nearest(points)[1]]
     along = np.cross(normal, np.eye(3)[np.abs(normal).argmin(axis=1)])
     along /= np.linalg.norm(along, axis=1, keepdims=True)
@@ -216,12 +178,12 @@ def sample_pressure(
     over = points[:, None] + np.sqrt(area_mm2 / np.pi)[:, None, None] * across
     turn = Rotation.from_rotvec(np.radians(row.turn) @ fit.frame)
     moved = fit.pivot + row.move @ fit.frame + turn.apply(over.reshape(-1, 3) - fit.pivot)
-    surface = extract_outer_surface(run.mesh, held.displacement)
+    surface = extract_outer_surface(model.mesh, held.displacement)
     if onto is None:
         _, face, moved = surface.find_nearest(moved)
     else:
         face = onto.reshape(-1)
-    outer = np.unique(run.mesh.face_sets[OUTER])
+    outer = np.unique(model.mesh.face_sets[OUTER])
     values = interpolate_values(surface, held.pressure[outer][None], face, moved)[0]
     return values.reshape(-1, len(DISC)) @ WEIGHTS, face.reshape(-1, len(DISC))
 

@@ -1,4 +1,4 @@
-"""The limb of a study as sockets are put on it, and a socket put on and loaded: a job, and what is stored."""
+"""The limb of a study, a model of it in a socket, and the simulation of that as a job with stored results."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,7 +41,7 @@ from ...socket import Socket
 from ...socket.landmarks import SkinRegion, find_directions, find_load_point
 from ...study import Study
 from ..engine.context import Context
-from ..engine.digests import code_digest, compute_digest, compute_file_digest
+from ..engine.digests import code_digest, compute_digest
 from ..engine.store import Made, ResultFiles
 from ..limb.mesh import is_meshed, keep_mesh, mesh_settings, read_mesh_facts, read_stored_depth
 from ..simulation.limb_geometry import find_fibre_directions
@@ -49,6 +49,7 @@ from .intervals import ParameterSpread, SimulationSpread, spread_to_facts
 from .shape import LINER, build_regions, find_covered_regions, load_of, mesh_edge_mm
 
 MESH = "limb.vtu"
+REGION = "region."  # in the name of a packed mask
 BELOW_BRIM_MM = 15.0  # edges are short from so far above the brim on
 FAR, GROWTH, FLATNESS = 3.5, 0.5, 1.6  # edges near the proximal cut over those below, and how elements grow
 
@@ -101,42 +102,17 @@ class SocketLimb:
             keep_mesh(mesh, facts, file)
         return read_vtu(file), read_mesh_facts(file)
 
-    @property
-    def liner(self) -> LinerFacts:
-        """What is stored of the liner."""
-        table = self.study.socket.liner
-        return LinerFacts(thickness_mm=table.thickness_mm, material=table.material, **table.parameters)
-
-
-@dataclass(frozen=True, eq=False)
-class SocketRun:
-    """A socket's face that is put on a meshed limb and loaded, and where what comes of it is kept.
-
-    With ``sensitivities`` there are derivatives by the ``parameters`` of the tissues. ``threads`` are by
-    default the machine's.
-    """
-
-    name: str
-    limb: SocketLimb
-    mesh: Mesh
-    parameters: Parameters
-    face: Socket
-    kept: ResultFiles | None = None
-    sensitivities: bool = False
-    threads: int | None = None
-
-    @cached_property
-    def fit(self) -> SocketFit:
-        """How the socket comes on the limb, and its loads."""
-        study, anatomy, socket = self.limb.study, self.limb.anatomy, self.face
+    def build_model(self, face: Socket, mesh: Mesh) -> SocketModel:
+        """The model of the limb with this ``mesh`` in a socket with this ``face``."""
+        study, anatomy = self.study, self.anatomy
         table, known = study.socket, find_directions(anatomy, study.socket.side)
         loads = []
         for load in table.loads:
-            force, moment, point = load_of(study, load, anatomy, socket)
+            force, moment, point = load_of(study, load, anatomy, face)
             loads.append(Load(load.name, force, moment, point, load.duration_s, load.hold_s))
-        depth = float(np.ptp(socket.points @ known.proximal))
-        return SocketFit(
-            pivot=find_load_point(anatomy, socket.points[socket.brim]),
+        depth = float(np.ptp(face.points @ known.proximal))
+        fit = SocketFit(
+            pivot=find_load_point(anatomy, face.points[face.brim]),
             proximal=known.proximal,
             anterior=known.anterior,
             friction=table.friction,
@@ -145,43 +121,98 @@ class SocketRun:
             travel_mm=None if table.donning == "growth" else table.travel_mm or depth,
             loads=tuple(loads),
         )
+        middles = mesh.points[mesh.face_sets[OUTER][:, :3]].mean(axis=1)
+        faces = find_covered_regions(middles, anatomy.skin, self.regions, face)
+        return SocketModel(study, mesh, face, fit, faces, self.fibres)
 
-    def write_face(self, file: Path) -> None:
-        """Write the face with its signed distance from the unloaded limb, negative where pressed in."""
-        face = self.face.surface.to_pyvista()
-        face.point_data["offset_mm"] = -self.face.offset(self.limb.outer.skin)
-        face.save(file)
-
-    @cached_property
-    def faces(self) -> dict[str, NDArray[np.bool_]]:
-        """Which faces (f,) under the socket belong to each region: those whose nearest skin does."""
-        limb, middles = self.limb, self.mesh.points[self.mesh.face_sets[OUTER][:, :3]].mean(axis=1)
-        return find_covered_regions(middles, limb.anatomy.skin, limb.regions, self.face)
+    def write_face(self, face: Socket, file: Path) -> None:
+        """Write a face with its signed distance from the unloaded limb, negative where pressed in."""
+        drawn = face.surface.to_pyvista()
+        drawn.point_data["offset_mm"] = -face.offset(self.outer.skin)
+        drawn.save(file)
 
     @property
-    def laws(self) -> dict[str, Material]:
-        """Of the tissues and the liner."""
-        load_extensions(self.limb.study.extensions)  # a worker has not read the study
-        table, liner = self.limb.study.material, self.limb.study.socket.liner
-        kappa, fibres = table.kappa_ratio, dict(self.limb.fibres)
-        laws = build_materials(self.parameters, kappa, table.law, fibres, table.relaxation_span_s)
+    def liner(self) -> LinerFacts:
+        """What is stored of the liner."""
+        table = self.study.socket.liner
+        return LinerFacts(thickness_mm=table.thickness_mm, material=table.material, **table.parameters)
+
+
+@dataclass(frozen=True, eq=False)
+class SocketModel:
+    """A limb in a socket, ready to be simulated: what a `SiteModel` is for an indentation.
+
+    ``fit`` is how the socket of this ``face`` comes on the limb of this ``mesh``, and its loads. ``faces``
+    are masks (f,) by region: the limb's outer faces under the socket whose nearest skin belongs to it.
+    ``fibres`` have a direction in each tissue that has some. Laws and the liner are the study's.
+    """
+
+    study: Study
+    mesh: Mesh
+    face: Socket
+    fit: SocketFit
+    faces: Mapping[str, NDArray[np.bool_]]
+    fibres: tuple[tuple[str, Direction], ...]
+
+    def build_laws(self, parameters: Parameters) -> dict[str, Material]:
+        """Those of the tissues with their ``parameters``, and of the liner."""
+        load_extensions(self.study.extensions)  # a worker has not read the study
+        table, liner = self.study.material, self.study.socket.liner
+        kappa, fibres = table.kappa_ratio, dict(self.fibres)
+        laws = build_materials(parameters, kappa, table.law, fibres, table.relaxation_span_s)
         return laws | build_materials({LINER: liner.parameters}, kappa) if liner.thickness_mm else laws
 
     @cached_property
-    def key(self) -> str:
-        """Of all that decides what the socket does to the limb, whose mesh lies above what is kept."""
-        assert self.kept is not None
-        study, face, fit = self.limb.study, self.face, self.fit
-        table = study.socket.model_dump(mode="json", exclude={"design", "worn_s", "measured"})
-        # Regions and loads follow from the names of the bones as well, which no mesh and no table holds.
-        loads = [(*load.force, *load.moment, *load.point) for load in fit.loads]
-        regions = {name: mask.tolist() for name, mask in self.faces.items()}
+    def digest(self) -> str:
+        """Of all that decides what the socket does to the limb, but for the parameters of its tissues."""
+        study, mesh, face = self.study, self.mesh, self.face
         return compute_digest(
-            *(table, study.material.model_dump(mode="json"), self.parameters, self.sensitivities),
-            *(compute_file_digest(self.kept.folder.parent / MESH), code_digest(solve_run)),
-            *(face.points.tolist(), face.clear.tolist(), compute_extensions_digest(study.extensions)),
-            *(fit.pivot.tolist(), loads, regions),
+            *(study.material.model_dump(mode="json"), study.socket.liner.model_dump(mode="json")),
+            *(mesh.points, mesh.cells, mesh.regions, mesh.region_names, mesh.held, mesh.face_sets[OUTER]),
+            *(face.points, face.faces, face.clear, asdict(self.fit), self.faces, self.fibres),
+            *(compute_extensions_digest(study.extensions), code_digest(solve_run)),
         )
+
+    def pack(self) -> Made:
+        """Facts and arrays of all but the study and the mesh, for `unpack`."""
+        face = {key: getattr(self.face, key) for key in ("points", "faces", "clear", "brim")}
+        regions = {f"{REGION}{name}": mask for name, mask in self.faces.items()}
+        return {"fit": asdict(self.fit), "fibres": self.fibres}, face | regions
+
+    @classmethod
+    def unpack(cls, study: Study, mesh: Mesh, made: Made) -> Self:
+        """The model of a ``study`` whose limb has this ``mesh``, from what `pack` made."""
+        facts, arrays = made[0], dict[str, Any](made[1])
+        faces = {key.removeprefix(REGION): arrays.pop(key) for key in list(arrays) if REGION in key}
+        loads = tuple(Load(**_to_arrays(load)) for load in facts["fit"].pop("loads"))
+        fit = SocketFit(**_to_arrays(facts["fit"]), loads=loads)
+        fibres = tuple((tissue, way if way == "flow" else tuple(way)) for tissue, way in facts["fibres"])
+        return cls(study, mesh, Socket(**arrays), fit, faces, fibres)
+
+
+def _to_arrays(facts: Mapping[str, Any]) -> dict[str, Any]:
+    """Facts with their lists of three numbers as arrays (3,)."""
+    return {key: np.array(one) if isinstance(one, list) else one for key, one in facts.items()}
+
+
+@dataclass(frozen=True, eq=False)
+class SocketRun:
+    """A model that is simulated with the ``parameters`` of its tissues, and where what comes of it is kept.
+
+    With ``sensitivities`` there are derivatives by these. ``threads`` are by default the machine's.
+    """
+
+    name: str
+    model: SocketModel
+    parameters: Parameters
+    kept: ResultFiles | None = None
+    sensitivities: bool = False
+    threads: int | None = None
+
+    @cached_property
+    def key(self) -> str:
+        """Of all that decides what comes of it."""
+        return compute_digest(self.model.digest, self.parameters, self.sensitivities)
 
     @property
     def partial_key(self) -> str:
@@ -194,7 +225,8 @@ def solve_run(run: SocketRun, tell: Callable[[float, float, str], None]) -> Donn
 
     Raises `RunError` where the simulation does not come to its end.
     """
-    fit, kept = run.fit, run.kept
+    model, kept = run.model, run.kept
+    fit = model.fit
     end = fit.ends[-1][2]
 
     def report_row(row: SocketStep) -> None:
@@ -202,12 +234,12 @@ def solve_run(run: SocketRun, tell: Callable[[float, float, str], None]) -> Donn
         words = f"{row.time:.2f} of {end:g} s: {force:.0f} N, {row.whole.peak_kPa:.0f} kPa at most"
         tell(row.time, end, words)
 
-    problem = build_socket_problem(run.mesh, run.laws, run.face, fit)
+    problem = build_socket_problem(model.mesh, model.build_laws(run.parameters), model.face, fit)
     before = None if kept is None else kept.find(run.partial_key)
     found = simulate_donning(
-        replace(problem, fibres=build_fibre_field(run.limb.fibres, run.mesh)),
+        replace(problem, fibres=build_fibre_field(model.fibres, model.mesh)),
         fit,
-        run.faces,
+        model.faces,
         sensitivities=run.sensitivities,
         on_row=report_row,
         threads=run.threads,
@@ -260,7 +292,7 @@ def simulate_socket(run: SocketRun) -> Made:
             for name, held in found.held.items()
             for part in ("pressure", "shear", "displacement")
         }
-        return summarise_run(run, found), fields
+        return summarise_run(run.model, found), fields
 
     made = run.kept.get(run.key, make)
     run.kept.drop(run.partial_key)
@@ -297,12 +329,12 @@ def _describe_stop(found: DonningResult, fit: SocketFit) -> str:
 
 
 def summarise_run(
-    run: SocketRun, found: DonningResult, known: ParameterSpread | None = None
+    model: SocketModel, found: DonningResult, known: ParameterSpread | None = None
 ) -> dict[str, Any]:
     """What is stored of a simulation, with intervals where parameters are ``known`` so well."""
-    fit, names, statistics = run.fit, found.result.parameter_names, found.result.statistics
-    spread = None if known is None else SimulationSpread.make(run.limb.study, names, known)
-    held = {name: _summarise_state(run, one, spread) for name, one in found.held.items()}
+    names, statistics = found.result.parameter_names, found.result.statistics
+    fit, spread = model.fit, None if known is None else SimulationSpread.make(model.study, names, known)
+    held = {name: _summarise_state(model, one, spread) for name, one in found.held.items()}
     base, loads = found.held["donning"].row, []
     for load in fit.loads:
         here = found.held[load.name]
@@ -324,7 +356,7 @@ def summarise_run(
     }
 
 
-def _summarise_state(run: SocketRun, one: LoadedState, spread: SimulationSpread | None) -> dict[str, Any]:
+def _summarise_state(model: SocketModel, one: LoadedState, spread: SimulationSpread | None) -> dict[str, Any]:
     row = one.row
     return {
         "time_s": row.time,
@@ -337,13 +369,13 @@ def _summarise_state(run: SocketRun, one: LoadedState, spread: SimulationSpread 
             | spread_to_facts(spread, "", "kPa", patch.mean_kPa, one.slopes.get(name))
             for name, patch in row.regions.items()
         ],
-        "inside": _summarise_strain(run, one),
+        "inside": _summarise_strain(model, one),
     }
 
 
-def _summarise_strain(run: SocketRun, one: LoadedState) -> list[dict[str, Any]]:
+def _summarise_strain(model: SocketModel, one: LoadedState) -> list[dict[str, Any]]:
     """Strain of each tissue under the liner, and where most: the place at rest, the region nearest to it."""
-    mesh, faces = run.mesh, run.faces
+    mesh, faces = model.mesh, model.faces
     middles = mesh.points[mesh.face_sets[OUTER][:, :3]].mean(axis=1)
     rows = []
     for number, tissue in enumerate(mesh.region_names):

@@ -18,6 +18,7 @@ from ...indentation import Parameters
 from ...mesh import write_vtu
 from ...results.identification import RecordedExtents, RelaxationBeyond
 from ...results.socket import SocketResult, SocketSamples, SocketShape
+from ...socket import Socket
 from ...socket.landmarks import find_bone
 from ...socket.published import select_published_findings
 from ...study import Study
@@ -28,7 +29,15 @@ from ..simulation.loading import NEAR_MM, LimbAxis, describe_socket_load, name_l
 from .intervals import CHANGE_PERCENT, FRICTION, ParameterSpread, draw_step, store_change, widen_intervals
 from .measured import compare_measured, describe_measured
 from .shape import build_loadable_socket, check_tissues
-from .simulation import SocketLimb, SocketRun, run_sockets, simulate_socket, solve_run, summarise_run
+from .simulation import (
+    SocketLimb,
+    SocketModel,
+    SocketRun,
+    run_sockets,
+    simulate_socket,
+    solve_run,
+    summarise_run,
+)
 
 NAME = "socket"
 NOT_COMPARED = (
@@ -74,8 +83,9 @@ def run_socket(
     write_surface(folder / "socket.stl", socket.surface)
     mesh, facts = limb.mesh(folder, socket, partial(context.tell, NAME, 0, 0))
     kept = ResultFiles(folder / RUNS, also=[context.store[NAME] / RUNS])
-    run = SocketRun(NAME, limb, mesh, parameters, socket, kept, sensitivities=covariance_log is not None)
-    run.write_face(folder / "socket-face.vtp")
+    model = limb.build_model(socket, mesh)
+    run = SocketRun(NAME, model, parameters, kept, sensitivities=covariance_log is not None)
+    limb.write_face(socket, folder / "socket-face.vtp")
     found = solve_run(run, partial(context.tell, NAME))
     known = None
     if covariance_log is not None:
@@ -85,8 +95,8 @@ def run_socket(
             spread = RelaxationSpread.from_stored(RelaxationBeyond.model_validate(relaxation))
             own, worn = spread.own_weight, spread.interpolate(study.socket.worn_s)
             known = ParameterSpread(own * known.covariance, own * off, *worn)
-    content = summarise_run(run, found, known)
-    compared = _compare_with_records(run, found, recorded_range)
+    content = summarise_run(model, found, known)
+    compared = _compare_with_records(limb, model, found, recorded_range)
     for held in (content["donning"], *content["loads"]):
         held |= compared[held.get("name", "donning")]
     outside_text, simulated = list[str](), None
@@ -96,15 +106,15 @@ def run_socket(
         if samples:
             steps = [draw_step(np.array(covariance_log), number) for number in range(samples)]
             simulated = _simulate_samples(context, run, content, steps)
-    sensors, agreement = compare_measured(run, found, content)
+    sensors, agreement = compare_measured(limb, model, found, content)
     result = SocketResult(
         **content,
         parameters=parameters,
         parameters_from=parameters_from,
-        socket=_describe_shape(run),
+        socket=_describe_shape(limb, socket),
         mesh=facts,
         # All that was found is of transtibial limbs.
-        published=select_published_findings(run.faces) if find_bone(limb.anatomy, "tibia") else [],
+        published=select_published_findings(model.faces) if find_bone(limb.anatomy, "tibia") else [],
         samples=simulated,
         worn_s=None if relaxation is None else study.socket.worn_s,
         outside_text=outside_text,
@@ -119,21 +129,21 @@ def run_socket(
     kept.drop(run.partial_key)
 
 
-def _describe_shape(run: SocketRun) -> SocketShape:
-    table, face = run.limb.study.socket, run.face
+def _describe_shape(limb: SocketLimb, face: Socket) -> SocketShape:
+    table = limb.study.socket
     return SocketShape(
         source="rectified" if table.file is None else table.file.name,
         reduction_percent=table.reduction_percent if table.file is None else None,
         areas=[area.name for area in table.areas],
         volume_cm3=face.volume_mm3 / 1000.0,
-        deepest_mm=face.offset(run.limb.outer.skin).max(),
+        deepest_mm=face.offset(limb.outer.skin).max(),
         notes=list(face.notes),
-        liner=run.limb.liner,
+        liner=limb.liner,
     )
 
 
 def _compare_with_records(
-    run: SocketRun, found: DonningResult, stored: Mapping[str, Any] | None
+    limb: SocketLimb, model: SocketModel, found: DonningResult, stored: Mapping[str, Any] | None
 ) -> dict[str, dict[str, Any]]:
     """What donning and each load do to the tissue, and what of it no fitted record did, by name.
 
@@ -142,8 +152,8 @@ def _compare_with_records(
     if stored is None:
         return {name: {"loading": None, "outside_records": None} for name in found.held}
     tested = RecordedRange.from_stored(RecordedExtents.model_validate(stored))
-    axis, before = LimbAxis(run.limb.anatomy), list[Extent]()
-    mesh, study = run.mesh, run.limb.study
+    axis, before = LimbAxis(limb.anatomy), list[Extent]()
+    mesh, study = model.mesh, model.study
     near_mm = NEAR_MM + study.socket.liner.thickness_mm
     compared, histories = {}, time_socket_loads(study.socket)
     for name, held in found.held.items():
@@ -163,17 +173,16 @@ def _simulate_samples(
     More friction is simulated beside them, where there is some, and what it changes stored. Told are how many
     draws came to their end, and why others did not.
     """
-    study, plain = run.limb.study, replace(run, sensitivities=False)
+    study, plain = context.study, replace(run, sensitivities=False)
     at = study.vector(run.parameters)
     jobs = [
         replace(plain, name=f"draw {n}", parameters=study.by_tissue(at * np.exp(step)))
         for n, step in enumerate(steps, 1)
     ]
-    table = study.socket
-    if not isinstance(table.friction, str) and table.friction > 0.0:
-        more = {"friction": table.friction * (1.0 + CHANGE_PERCENT / 100.0)}
-        rougher = study.model_copy(update={"socket": table.model_copy(update=more)})
-        jobs.append(replace(plain, name=FRICTION, limb=replace(run.limb, study=rougher)))
+    fit = run.model.fit
+    if not isinstance(fit.friction, str) and fit.friction > 0.0:
+        rougher = replace(fit, friction=fit.friction * (1.0 + CHANGE_PERCENT / 100.0))
+        jobs.append(replace(plain, name=FRICTION, model=replace(run.model, fit=rougher)))
     tell = partial(context.tell, NAME)
     reasons = run_sockets(jobs, context.executor, lambda done, words: tell(done, len(jobs), words))
     ended = [None if reason else simulate_socket(one)[0] for one, reason in zip(jobs, reasons, strict=True)]
