@@ -90,11 +90,7 @@ def run_socket(
     known = None
     if covariance_log is not None:
         off = np.log(study.vector(most_probable or parameters) / study.vector(parameters))
-        known = ParameterSpread(np.array(covariance_log), off)
-        if relaxation is not None:
-            spread = RelaxationSpread.from_stored(RelaxationBeyond.model_validate(relaxation))
-            own, worn = spread.own_weight, spread.interpolate(study.socket.worn_s)
-            known = ParameterSpread(own * known.covariance, own * off, *worn)
+        known = _build_spread(np.array(covariance_log), off, relaxation, study.socket.worn_s)
     content = summarise_run(model, found, known)
     compared = _compare_with_records(limb, model, found, recorded_range)
     for held in (content["donning"], *content["loads"]):
@@ -127,6 +123,17 @@ def run_socket(
         write_vtu(mesh, folder / f"held-{i}.vtu", point_data=fields, cell_data=one.strains.fields)
     _write_tables(folder, result)
     kept.drop(run.partial_key)
+
+
+def _build_spread(
+    covariance: Array, off: Array, relaxation: Mapping[str, Any] | None, worn_s: float
+) -> ParameterSpread:
+    """How well parameters are known, with ``relaxation`` beyond the records in a socket worn for so long."""
+    if relaxation is None:
+        return ParameterSpread(covariance, off)
+    spread = RelaxationSpread.from_stored(RelaxationBeyond.model_validate(relaxation))
+    own = spread.own_weight
+    return ParameterSpread(own * covariance, own * off, *spread.interpolate(worn_s))
 
 
 def _describe_shape(limb: SocketLimb, face: Socket) -> SocketShape:
