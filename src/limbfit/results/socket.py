@@ -1,5 +1,6 @@
 """The limb in its socket: the stage `sensors`, and the experiments `socket` and `socket_design`."""
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import ClassVar
 
@@ -166,14 +167,19 @@ class SocketSamples(ResultPart):
     failed: Sequence[str] = Field(description="Why others did not.")
 
 
-class PlacedCell(ResultPart):
+class SensorCell(ResultPart):
     """A cell of a sensor in the socket, and what it read."""
 
     cell: str = Field(description="Its name; of a sheet, row and column.")
     state: str = Field(description="`compared`, or why it is not, such as `dead` or `saturated`.")
     position_mm: Vector = Field(description="Its place on the donned socket, LPS.")
-    area_mm2: float = Field(description="Its area.")
     measured_kPa: float | None = Field(description="Mean of its readings; null: it has none.")
+
+
+class PlacedCell(SensorCell):
+    """A cell of a sensor whose pressure may count in the calibration."""
+
+    area_mm2: float = Field(description="Its area.")
 
 
 class PlacedSensor(ResultPart):
@@ -181,10 +187,21 @@ class PlacedSensor(ResultPart):
 
     name: str = Field(description="Name of the recording.")
     load: str = Field(description="The load that it belongs to.")
-    error_kPa: float = Field(description="What 95 % of readings are within, and the percentage of them.")
-    error_percent: float = Field(description="Of a reading, that 95 % are within.")
+    error_kPa: float = Field(description="What 95 % of readings are within, beside the percentage.")
+    error_percent: float = Field(description="The part of a reading that 95 % of readings are within.")
     stretch_percent: float | None = Field(description="How a sheet stretches over the face; null: no sheet.")
     cells: Sequence[PlacedCell] = Field(description="Each cell.")
+
+    @property
+    def counts(self) -> Mapping[str, int]:
+        """Number of cells in each state."""
+        return Counter(cell.state for cell in self.cells)
+
+    @property
+    def words(self) -> str:
+        """How many cells are in each state, and how far a sheet stretches."""
+        words = ", ".join(f"{count} {state}" for state, count in sorted(self.counts.items()))
+        return f"{words}; stretched by {self.stretch_percent:.1f} %" if self.stretch_percent else words
 
 
 class SensorsResult(StoredResult):
@@ -197,16 +214,12 @@ class SensorsResult(StoredResult):
     sensors: Sequence[PlacedSensor] = Field(description="Each recording.")
 
 
-class MeasuredCell(ResultPart):
+class MeasuredCell(SensorCell):
     """What a cell of a sensor read, and what the model has there."""
 
-    cell: str = Field(description="Its name; of a sheet, row and column.")
-    state: str = Field(description="`compared`, or why it is not, such as `dead` or `saturated`.")
     regions: Sequence[str] = Field(description="Regions of the limb that it lies on, the smallest first.")
-    position_mm: Vector = Field(description="Its place on the donned socket, LPS.")
     level_mm: float = Field(description="Its distance from the limb's distal end, along the limb.")
     angle_deg: float = Field(description="Its direction about the limb.")
-    measured_kPa: float | None = Field(description="Mean of its readings; null: it has none.")
     error_kPa: float = Field(description="What 95 % of readings are within.")
     model_kPa: float = Field(description="Mean pressure of the model over its area.")
     interval_kPa: Interval | None = Field(description="95 % interval of that; null: not known.")

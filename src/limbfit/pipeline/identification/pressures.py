@@ -26,7 +26,7 @@ from ...socket.sensors import COMPARED
 from ...study import Study
 from ..engine.digests import code_digest, compute_digest
 from ..engine.store import RUNS, Made, ResultFiles
-from ..socket.measured import sample_pressure
+from ..socket.measured import sample_pressure, stack_cells
 from ..socket.sensors import MODEL
 from ..socket.simulation import MESH, SocketModel, SocketRun, solve_run
 from .answer import FineMeshCorrection, sample_intervals
@@ -35,7 +35,6 @@ from .search import RecordSimulator, Report
 FOLDER = "socket"
 MAX_ROUNDS = 4
 _STEP = 1e-4  # of a parameter's logarithm, for derivatives
-_READ = ("area_mm2", "measured_kPa")  # of a cell that is compared
 TOLERANCE_SD = 0.3  # of what all pressures together tell: it is enough that they move by less
 NOT_SETTLED = "the parameters still moved when the socket had been simulated as often as it may be"
 
@@ -107,8 +106,7 @@ def compare_cells(model: SocketModel, sensors: Sequence[PlacedSensor], found: Do
     own = [(tissue, parameter.name) for tissue in study.tissues for parameter in study.law.parameters]
     for sensor in sensors:
         held, cells = found.held[sensor.load], [cell for cell in sensor.cells if cell.state == COMPARED]
-        points = np.array([cell.position_mm for cell in cells]).reshape(-1, 3)
-        areas, measured = (np.array([getattr(cell, key) for cell in cells]) for key in _READ)
+        points, areas, measured = stack_cells(cells)
         simulated, below = sample_pressure(model, held, points, areas)
         derivatives = np.zeros((len(points), len(own)))
         for i, name in enumerate(own):

@@ -8,9 +8,7 @@ between which 95 % of such differences lie.
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from functools import lru_cache
 from typing import Any
 
@@ -27,7 +25,7 @@ from ...donning import DonningResult, LoadedState, extract_outer_surface
 from ...donning.model import OUTER
 from ...errors import StudyError, add_location
 from ...identify.fit.prediction import NORMAL_95
-from ...results.socket import MeasuredCell, PressureAgreement, SensorComparison
+from ...results.socket import MeasuredCell, PlacedCell, PlacedSensor, PressureAgreement, SensorComparison
 from ...socket import Socket
 from ...socket.rays import compute_profile
 from ...socket.sensors import COMPARED, SensorFrames, SheetLayout, read_recording
@@ -42,6 +40,7 @@ OFF, ALL = "off the socket", "all"  # a cell that the face does not reach, and c
 # Points of a disc of radius 1, and their weights: exact to the fifth order (Abramowitz and Stegun, 25.4.61).
 _TURNS = np.radians(60.0 * np.arange(6))
 DISC = np.vstack([[0.0, 0.0], np.sqrt(2.0 / 3.0) * np.column_stack([np.cos(_TURNS), np.sin(_TURNS)])])
+_READ = ("area_mm2", "measured_kPa")  # of a cell
 WEIGHTS = np.array([1 / 4, *[1 / 8] * 6])
 
 
@@ -57,11 +56,11 @@ def read_sensors(study: Study, table: MeasuredTable) -> SensorFrames:
 
 def place_sensors(
     study: Study, table: MeasuredTable, socket: Socket, anatomy: Anatomy, outer: Surface
-) -> tuple[SensorFrames, list[str], float | None]:
+) -> PlacedSensor:
     """Place what a table of ``socket.measured`` states on a socket around the ``outer`` surface of a limb.
 
-    Returns the recording with positions, what each cell is, `OFF` where the socket does not reach it, and by
-    how many percent a sheet stretches. Raises `InputError` for what cannot be right, with the remedy.
+    A cell that the socket does not reach is `OFF` it. Raises `InputError` for what cannot be right, with the
+    remedy.
     """
     recording, place = read_sensors(study, table), f"socket.measured.{table.name}"
     points, layout, stretch = recording.position, recording.layout, None
@@ -81,13 +80,28 @@ def place_sensors(
             what += f" {far.argmax() + 1} lies {far.max():.0f} mm from the socket's face"
             raise StudyError(what, remedy="correct its position (LPS, mm), or state a larger within_mm")
         if layout is not None and recording.place is not None:
-            cells = np.array([(one.row - 1, one.column - 1) for one in table.landmarks])
+            marked = np.array([(one.row - 1, one.column - 1) for one in table.landmarks])
             rays = compute_profile(outer, anatomy.frame).rays
-            whole, stretch = wrap_sheet(layout, cells, points, socket, rays, anatomy.frame)
+            whole, stretch = wrap_sheet(layout, marked, points, socket, rays, anatomy.frame)
             points = whole[tuple(recording.place.T)]
-    covers = socket.find_covered(points)
-    states = [state if there else OFF for state, there in zip(recording.states, covers, strict=True)]
-    return replace(recording, position=points), states, stretch
+    covers, means = socket.find_covered(points), recording.frames.mean(axis=0)
+    columns = {
+        "cell": recording.names,
+        "state": [state if there else OFF for state, there in zip(recording.states, covers, strict=True)],
+        "position_mm": points,
+        "area_mm2": recording.area_mm2,
+        "measured_kPa": [mean if np.isfinite(mean) else None for mean in means.tolist()],
+    }
+    cells = [PlacedCell(**dict(zip(columns, values))) for values in zip(*columns.values(), strict=True)]
+    stated = table.model_dump(include={"name", "load", "error_kPa", "error_percent"})
+    return PlacedSensor(**stated, stretch_percent=stretch, cells=cells)
+
+
+def stack_cells(cells: Sequence[PlacedCell]) -> tuple[Array, Array, Array]:
+    """Positions (n, 3) mm, areas (n,) mm2 and mean readings (n,) kPa of cells; nan where there is none."""
+    positions = np.array([cell.position_mm for cell in cells]).reshape(-1, 3)
+    areas, measured = (np.array([getattr(cell, key) for cell in cells], float) for key in _READ)
+    return positions, areas, measured
 
 
 def describe_measured(study: Study, anatomy: Anatomy | None) -> list[str]:
@@ -102,10 +116,7 @@ def describe_measured(study: Study, anatomy: Anatomy | None) -> list[str]:
     outer = _build_outer_surface(anatomy, thickness) if thickness else anatomy.skin
     socket = build_socket(study, anatomy, outer)
     for one in tables:
-        _, states, stretch = place_sensors(study, one, socket, anatomy, outer)
-        words = ", ".join(f"{count} {state}" for state, count in sorted(Counter(states).items()))
-        words += f"; stretched by {stretch:.1f} %" if stretch else ""
-        said.append(f"socket.measured.{one.name}: {words}")
+        said.append(f"socket.measured.{one.name}: {place_sensors(study, one, socket, anatomy, outer).words}")
     return said
 
 
@@ -122,36 +133,26 @@ def compare_measured(
     held = {one["name"]: one for one in content["loads"]} | {"donning": content["donning"]}
     sizes = {name: mask.sum() for name, mask in model.faces.items()}
     for table in limb.study.socket.measured:
-        recording, states, stretch = place_sensors(
-            limb.study, table, model.face, limb.anatomy, limb.outer.skin
-        )
-        assert recording.position is not None
-        simulated, below = sample_pressure(
-            model, found.held[table.load], recording.position, recording.area_mm2
-        )
-        mean = recording.frames.mean(axis=0)
+        placed = place_sensors(limb.study, table, model.face, limb.anatomy, limb.outer.skin)
+        points, areas, measured = stack_cells(placed.cells)
+        simulated, below = sample_pressure(model, found.held[table.load], points, areas)
         rows = {row["region"]: row for row in held[table.load]["regions"]}
-        faces = below[:, 0] % len(
-            model.mesh.face_sets[OUTER]
-        )  # of the mesh: its parts come one after another
+        faces = below[:, 0] % len(model.mesh.face_sets[OUTER])  # its parts come one after another
         around = [sorted((n for n in sizes if model.faces[n][face]), key=sizes.__getitem__) for face in faces]
+        pairs = zip(simulated, around, strict=True)
         columns = {
-            "cell": recording.names,
-            "state": states,
             "regions": around,
-            "position_mm": recording.position,
-            "level_mm": axis.measure_level(recording.position),
-            "angle_deg": axis.measure_angle(recording.position),
-            "measured_kPa": [value if np.isfinite(value) else None for value in mean.tolist()],
-            "error_kPa": np.hypot(table.error_kPa, 0.01 * table.error_percent * np.nan_to_num(mean)),
+            "level_mm": axis.measure_level(points),
+            "angle_deg": axis.measure_angle(points),
+            "error_kPa": np.hypot(table.error_kPa, 0.01 * table.error_percent * np.nan_to_num(measured)),
             "model_kPa": simulated,
-            "interval_kPa": [
-                _scale_interval(p, [rows[n] for n in names]) for p, names in zip(simulated, around)
-            ],
+            "interval_kPa": [_scale_interval(p, [rows[name] for name in names]) for p, names in pairs],
         }
-        named = {"name": table.name, "load": table.load, "stretch_percent": stretch}
-        cells = [dict(zip(columns, values)) for values in zip(*columns.values(), strict=True)]
-        sensors.append(SensorComparison.model_validate({**named, "counts": Counter(states), "cells": cells}))
+        own = [cell.model_dump(exclude={"area_mm2"}) for cell in placed.cells]
+        more = [dict(zip(columns, values)) for values in zip(*columns.values(), strict=True)]
+        cells = [MeasuredCell(**cell, **beside) for cell, beside in zip(own, more, strict=True)]
+        named = placed.model_dump(include={"name", "load", "stretch_percent"})
+        sensors.append(SensorComparison(**named, counts=placed.counts, cells=cells))
     return sensors, summarise_agreement(sensors)
 
 

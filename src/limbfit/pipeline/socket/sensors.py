@@ -3,13 +3,10 @@
 from functools import partial
 from pathlib import Path
 
-import numpy as np
-
-from ...results.socket import PlacedCell, PlacedSensor, SensorsResult
-from ...socket.sensors import COMPARED
+from ...results.socket import SensorsResult
 from ..engine.context import Context
 from ..engine.store import ResultFiles, write_result
-from .measured import OFF, place_sensors
+from .measured import place_sensors
 from .shape import build_loadable_socket, mesh_edge_mm
 from .simulation import SocketLimb
 
@@ -24,23 +21,10 @@ def run_sensors(context: Context, folder: Path) -> None:
     """
     study, limb = context.study, SocketLimb.from_context(context, NAME)
     socket = build_loadable_socket(study, limb.anatomy, limb.outer.skin)
-    sensors = []
-    for table in study.socket.measured:
-        recording, states, stretch = place_sensors(study, table, socket, limb.anatomy, limb.outer.skin)
-        means = recording.frames.mean(axis=0)
-        columns = {
-            "cell": recording.names,
-            "state": states,
-            "position_mm": recording.position,
-            "area_mm2": recording.area_mm2,
-            "measured_kPa": [value if np.isfinite(value) else None for value in means.tolist()],
-        }
-        cells = [PlacedCell(**dict(zip(columns, values))) for values in zip(*columns.values(), strict=True)]
-        stated = table.model_dump(include={"name", "load", "error_kPa", "error_percent"})
-        sensors.append(PlacedSensor(**stated, stretch_percent=stretch, cells=cells))
-        count = states.count(COMPARED)
-        words = f"{table.name}: {count} of {len(cells)} cells count, {states.count(OFF)} are {OFF}"
-        context.tell(NAME, 0, 0, words)
+    tables, outer = study.socket.measured, limb.outer.skin
+    sensors = [place_sensors(study, table, socket, limb.anatomy, outer) for table in tables]
+    for one in sensors:
+        context.tell(NAME, 0, 0, f"{one.name}: {one.words}")
     mesh, facts = limb.mesh(folder, socket, partial(context.tell, NAME, 0, 0))
     ResultFiles(folder).put(MODEL, limb.build_model(socket, mesh).pack())
     limb.write_face(socket, folder / "socket-face.vtp")
