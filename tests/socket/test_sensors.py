@@ -8,7 +8,7 @@ from socket_limbs import round_limb
 
 from limbfit.errors import InputError, SurfaceError
 from limbfit.phantom.build import make_phantom, render_template
-from limbfit.pipeline.socket.phantom_sensors import record_pressure
+from limbfit.pipeline.socket.sensors import record_pressure
 from limbfit.socket import Recipe, rectify_limb
 from limbfit.socket.rays import compute_profile
 from limbfit.socket.rectify import Trim

@@ -10,7 +10,7 @@ from limbfit.pipeline.commands.planning import choose_tissues
 from limbfit.pipeline.commands.simulate import simulate_site
 from limbfit.pipeline.engine.store import Store
 from limbfit.pipeline.identification.pressures import PressureSimulator
-from limbfit.pipeline.socket.phantom_sensors import write_true_sensors
+from limbfit.pipeline.socket.sensors import write_true_sensors
 from small_limb import limb, small_limb
 
 LOADED = """hold_s = 0.0

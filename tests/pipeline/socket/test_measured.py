@@ -17,7 +17,7 @@ from limbfit.pipeline.commands.planning import choose_tissues
 from limbfit.pipeline.engine.context import Context, ignore_progress
 from limbfit.pipeline.engine.store import ResultFiles, Store
 from limbfit.pipeline.socket.measured import describe_measured, sample_pressure, summarise_agreement
-from limbfit.pipeline.socket.phantom_sensors import write_true_sensors
+from limbfit.pipeline.socket.sensors import write_true_sensors
 from limbfit.pipeline.socket.shape import build_regions, build_socket
 from limbfit.pipeline.socket.simulation import SocketLimb, SocketModel
 from limbfit.results.socket import MeasuredCell, SensorComparison, SocketResult

@@ -16,7 +16,7 @@ from ...phantom.robot import simulate_true_force
 from ...study import load_study
 from ..engine.context import Listener, Progress, ignore_progress
 from ..engine.store import Store, read_json
-from ..socket.phantom_sensors import write_true_sensors
+from ..socket.sensors import write_true_sensors
 from .run import compile_in_background, run_study
 
 # A site of the paper's kind, of 20,922 nodes, and how often the paper's search improved its parameters.

@@ -41,7 +41,7 @@ from ..records.record_checks import choose_surface_points, tell_flags
 from ..records.secondary_measurements import read_motion
 from ..records.traces import run_traces
 from ..simulation.limb_geometry import LimbGeometry
-from ..socket.sensors import run_sensors
+from ..socket.measured import run_sensors
 from .experiments import EXPERIMENTS, SOCKET, check_experiment, compute_experiment_key, list_experiment_states
 from .report import run_report
 

@@ -26,8 +26,7 @@ from ...socket.sensors import COMPARED
 from ...study import Study
 from ..engine.digests import code_digest, compute_digest
 from ..engine.store import RUNS, Made, ResultFiles
-from ..socket.measured import sample_pressure, stack_cells
-from ..socket.sensors import MODEL
+from ..socket.measured import MODEL, sample_pressure, stack_cells
 from ..socket.simulation import MESH, SocketModel, SocketRun, solve_run
 from .answer import FineMeshCorrection, sample_intervals
 from .search import RecordSimulator, Report

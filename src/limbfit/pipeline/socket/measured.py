@@ -1,5 +1,7 @@
 """Pressures that sensors in the socket measured, beside those of the model at the same places.
 
+The stage ``sensors`` stores where they are, and a model of the limb in its socket, for the calibration.
+
 Cells move and turn with the socket, and the limb slides under them. The model's pressure is the mean over a
 cell's area; its interval is that of the smallest region around the cell, in proportion to the pressures.
 Agreement is that of Bland and Altman (Lancet 1986, 327:307): the mean of model minus measured, and limits
@@ -9,7 +11,8 @@ between which 95 % of such differences lie.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from functools import lru_cache
+from functools import lru_cache, partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -25,17 +28,27 @@ from ...donning import DonningResult, LoadedState, extract_outer_surface
 from ...donning.model import OUTER
 from ...errors import StudyError, add_location
 from ...identify.fit.prediction import NORMAL_95
-from ...results.socket import MeasuredCell, PlacedCell, PlacedSensor, PressureAgreement, SensorComparison
+from ...results.socket import (
+    MeasuredCell,
+    PlacedCell,
+    PlacedSensor,
+    PressureAgreement,
+    SensorComparison,
+    SensorsResult,
+)
 from ...socket import Socket
 from ...socket.rays import compute_profile
 from ...socket.sensors import COMPARED, SensorFrames, SheetLayout, read_recording
 from ...socket.wrapping import wrap_sheet
 from ...study import Study
 from ...study.socket import MeasuredTable
+from ..engine.context import Context
+from ..engine.store import ResultFiles, write_result
 from ..simulation.loading import LimbAxis
-from .shape import build_socket, place_errors
+from .shape import build_loadable_socket, build_socket, mesh_edge_mm, place_errors
 from .simulation import SocketLimb, SocketModel
 
+NAME, MODEL = "sensors", "model"  # the stage, and its file with a packed `SocketModel`
 OFF, ALL = "off the socket", "all"  # a cell that the face does not reach, and cells of any region
 # Points of a disc of radius 1, and their weights: exact to the fifth order (Abramowitz and Stegun, 25.4.61).
 _TURNS = np.radians(60.0 * np.arange(6))
@@ -95,6 +108,24 @@ def place_sensors(
     cells = [PlacedCell(**dict(zip(columns, values))) for values in zip(*columns.values(), strict=True)]
     stated = table.model_dump(include={"name", "load", "error_kPa", "error_percent"})
     return PlacedSensor(**stated, stretch_percent=stretch, cells=cells)
+
+
+def run_sensors(context: Context, folder: Path) -> None:
+    """Draw the socket around the limb, place the cells of its sensors on it, and mesh the limb in it.
+
+    The mesh of an interrupted run is kept. Errors as `build_loadable_socket` and `place_sensors`.
+    """
+    study, limb = context.study, SocketLimb.from_context(context, NAME)
+    socket = build_loadable_socket(study, limb.anatomy, limb.outer.skin)
+    tables, outer = study.socket.measured, limb.outer.skin
+    sensors = [place_sensors(study, table, socket, limb.anatomy, outer) for table in tables]
+    for one in sensors:
+        context.tell(NAME, 0, 0, f"{one.name}: {one.words}")
+    mesh, facts = limb.mesh(folder, socket, partial(context.tell, NAME, 0, 0))
+    ResultFiles(folder).put(MODEL, limb.build_model(socket, mesh).pack())
+    limb.write_face(socket, folder / "socket-face.vtp")
+    content = SensorsResult(edge_mm=mesh_edge_mm(study, socket), mesh=facts, sensors=sensors)
+    write_result(folder / f"{NAME}.json", content)
 
 
 def stack_cells(cells: Sequence[PlacedCell]) -> tuple[Array, Array, Array]:
