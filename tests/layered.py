@@ -167,9 +167,7 @@ def store_blocks(
         model = replace(model, indenter=study.indenter, law=study.material.law, extensions=study.extensions)
         model = replace(model, course=study.material.course)
         model = replace(model, relaxation_span_s=study.material.relaxation_span_s)
-        model = replace(
-            model, fibres=find_fibre_directions(Context(study, store, SerialExecutor(), lambda event: None))
-        )
+        model = replace(model, fibres=find_fibre_directions(study, store.results))
         _write_record(study, model, truth, np.random.default_rng(i))
         places.append(
             {"site": name, "region": "", "fitted": fitted, "position_mm": [0.0] * 3, "axis": [0.0, 0.0, -1.0]}

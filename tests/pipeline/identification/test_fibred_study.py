@@ -53,18 +53,16 @@ def test_their_direction_decides_the_calibration(tmp_path):
 
 
 def test_the_axis_is_the_normal_of_the_proximal_cut(context):
-    assert find_fibre_directions(context) == (("muscle", (1.0, 0.0, 0.0)),)
+    assert find_fibre_directions(study, context.results) == (("muscle", (1.0, 0.0, 0.0)),)
     along = study_of(context.study.folder)
-    axis = find_fibre_directions(Context(along, context.store, context.executor, context.listener))
+    axis = find_fibre_directions(along, context.results)
     assert axis == (("muscle", (0.0, 0.0, -1.0)),)
 
 
 def test_a_flow_is_known_site_by_site(context):
     """The study names it; the directions follow from each mesh."""
     study = study_of(context.study.folder, 'fibres = { muscle = "flow" }')
-    assert find_fibre_directions(Context(study, context.store, context.executor, context.listener)) == (
-        ("muscle", "flow"),
-    )
+    assert find_fibre_directions(study, context.results) == (("muscle", "flow"),)
 
 
 def test_a_site_s_problem_has_them_and_its_force_their_derivatives(context):

@@ -51,8 +51,8 @@ def test_pressures_of_cells_have_derivatives_with_respect_to_the_tissues(measure
     (measured / "study.toml").write_text(f"{text}\n[calibration]\nuse_socket_pressures = true\n")
     study = load_study(measured)
     run_study(study, until="sensors")
-    at, store = study.vector(choose_tissues(study, True, None)[0]), Store(study.results)
-    simulator = PressureSimulator(study, store["sensors"], tmp_path / "kept", store["calibrate"], print)
+    at = study.vector(choose_tissues(study, True, None)[0])
+    simulator = PressureSimulator(study, Store(study.results), tmp_path / "kept", print)
     number = [f"{tissue}.{name}" for tissue, name in study.parameters].index("muscle.c_kPa")
     step = 0.03 * np.eye(len(at))[number]
     here, less, more = (simulator.read_cells(at * np.exp(by), "here") for by in (0.0 * step, -step, step))

@@ -28,7 +28,7 @@ from ..simulation.limb_geometry import LimbGeometry
 from ..simulation.simulations import SimulationCache
 from ..socket.socket import check_socket
 from .answer import correct_answer, plan_coarser_meshes, sample_intervals
-from .pressures import PressureSimulator, count_pressures
+from .pressures import FOLDER, PressureSimulator, count_pressures
 from .search import (
     CalibrationProblem,
     RecordSimulator,
@@ -64,8 +64,7 @@ def run_calibrate(context: Context, folder: Path) -> None:
         wait()
     correction, pressures = correct_answer(simulator, starts.best, coarser), None
     if study.calibration.use_socket_pressures:
-        store = context.store
-        measured = PressureSimulator(study, store["sensors"], folder, store["calibrate"], report)
+        measured = PressureSimulator(study, context.store, folder / FOLDER, report)
         found, known, pressures = count_pressures(measured, simulator, starts.best, correction)
     else:
         found, known = sample_intervals(simulator, starts.best, correction)

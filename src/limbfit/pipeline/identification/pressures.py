@@ -25,9 +25,11 @@ from ...results.socket import PlacedSensor, SensorsResult
 from ...socket.sensors import COMPARED
 from ...study import Study
 from ..engine.digests import code_digest, compute_digest
-from ..engine.store import RUNS, Made, ResultFiles
-from ..socket.measured import MODEL, sample_pressure, stack_cells
-from ..socket.simulation import MESH, SocketModel, SocketRun, solve_run
+from ..engine.store import RUNS, Made, ResultFiles, Store
+from ..socket.measured import NAME as SENSORS
+from ..socket.measured import sample_pressure, stack_cells
+from ..socket.shape import build_loadable_socket
+from ..socket.simulation import MESH, SocketLimb, SocketModel, SocketRun, solve_run
 from .answer import FineMeshCorrection, sample_intervals
 from .search import RecordSimulator, Report
 
@@ -55,34 +57,33 @@ class CellReadings:
 
 @dataclass(frozen=True, eq=False)
 class PressureSimulator:
-    """Simulates the socket of a ``study`` as the stage ``sensors`` has stored it, and compares its pressures.
+    """Simulates the socket of a ``study`` on the mesh of the stage ``sensors``, and compares its pressures.
 
-    What was simulated is kept below ``folder``, that of the calibration; that of the one before, below
-    ``earlier``, is found too. ``report`` is given lines of progress.
+    What was simulated is kept in the calibration's ``folder``; what the one before has kept counts as well.
+    ``report`` is given lines of progress.
     """
 
     study: Study
-    sensors: Path
+    store: Store
     folder: Path
-    earlier: Path
     report: Report
 
     @cached_property
     def stored(self) -> SensorsResult:
         """The cells on the socket, and what they read."""
-        return SensorsResult.read(self.sensors.parent)
+        return self.store.results.sensors
 
     @cached_property
     def model(self) -> SocketModel:
         """The limb in the socket."""
-        packed = ResultFiles(self.sensors).find(MODEL)
-        assert packed is not None
-        return SocketModel.unpack(self.study, read_vtu(self.sensors / MESH), packed)
+        limb = SocketLimb.from_store(self.study, self.store)
+        socket = build_loadable_socket(self.study, limb.anatomy, limb.outer.skin)
+        return limb.build_model(socket, read_vtu(self.store[SENSORS] / MESH))
 
     @cached_property
     def kept(self) -> ResultFiles:
         """Simulations, by their keys."""
-        return ResultFiles(self.folder / FOLDER / RUNS, also=[self.earlier / FOLDER / RUNS])
+        return ResultFiles(self.folder / RUNS, also=[self.store["calibrate"] / FOLDER / RUNS])
 
     def read_cells(self, parameters: Array, title: str) -> CellReadings:
         """Simulate the socket with these parameters (p,), and compare; what was kept is not done again."""

@@ -14,6 +14,7 @@ from ...arrays import Array
 from ...indentation import Direction, SiteModel, build_clamping_pins, read_indenter, to_vector3
 from ...mesh import read_vtu
 from ...results.limb import PlacedSite
+from ...results.study_results import StudyResults
 from ...study import Indentation, IndenterTable, Site, Study, Vector
 from ..engine.context import Context, name_file_in_errors
 from ..engine.digests import compute_file_digest
@@ -70,17 +71,16 @@ def build_site_model(
 
     Raises `ProblemError` where the study's clamps do not meet the limb there.
     """
-    study: Study = context.study
-    site = one.site
-    placed = {row.site: row for row in context.results.sites.sites}[site.name]
+    study, results, site = context.study, context.results, one.site
+    placed = {row.site: row for row in results.sites.sites}[site.name]
     mesh, indenter = context.store["mesh"] / f"{site.name}.vtu", study.indenter_of(one)
     clamped: dict[str, Any] = {}
     if study.clamps is not None:
-        clamped = {"clamps": study.clamps, "along": read_limb_axis(context)}
+        clamped = {"clamps": study.clamps, "along": read_limb_axis(results)}
     model = SiteModel(
         name=one.name,
         site=site.name,
-        fibres=find_fibre_directions(context),
+        fibres=find_fibre_directions(study, results),
         mesh=mesh,
         mesh_digest=compute_file_digest(mesh),
         position=placed.position_mm,
@@ -163,18 +163,18 @@ def count_pins_met(
         return len(build_clamping_pins(*skin, tool, np.array(along), study.clamps))
 
 
-def find_fibre_directions(context: Context) -> tuple[tuple[str, Direction], ...]:
+def find_fibre_directions(study: Study, results: StudyResults) -> tuple[tuple[str, Direction], ...]:
     """The direction of the fibres in each tissue that has some, of length one, or that of a flow."""
 
     def find(stated: str | Vector) -> Direction:
         if isinstance(stated, str):
-            return "flow" if stated == "flow" else read_limb_axis(context)
+            return "flow" if stated == "flow" else read_limb_axis(results)
         return to_vector3(np.array(stated) / np.linalg.norm(stated))
 
-    return tuple((tissue, find(stated)) for tissue, stated in context.study.fibres.items())
+    return tuple((tissue, find(stated)) for tissue, stated in study.fibres.items())
 
 
-def read_limb_axis(context: Context) -> Vector:
+def read_limb_axis(results: StudyResults) -> Vector:
     """The limb's axis, proximally: the unit normal of its proximal cut."""
-    normal = np.array(context.results.surfaces.cut_normal)
+    normal = np.array(results.surfaces.cut_normal)
     return to_vector3(normal / np.linalg.norm(normal))

@@ -95,7 +95,7 @@ def run_socket_design(
         context.tell(NAME, done, total, words)
 
     with shape.place_errors(study, PLACE):
-        limb, target = SocketLimb.from_context(context, NAME), shape.build_target(study)
+        limb, target = SocketLimb.from_store(context.study, context.store), shape.build_target(study)
         plain, face = build_undeformed_socket(study, limb.anatomy, limb.outer.skin, optimise)
         mesh, facts = limb.mesh(folder, face, partial(context.tell, NAME, 0, 0))
         kept = ResultFiles(folder / RUNS, also=[context.store[NAME] / RUNS])

@@ -1,6 +1,6 @@
 """Pressures that sensors in the socket measured, beside those of the model at the same places.
 
-The stage ``sensors`` stores where they are, and a model of the limb in its socket, for the calibration.
+The stage ``sensors`` stores where they are, and the mesh of the limb in its socket, for the calibration.
 
 Cells move and turn with the socket, and the limb slides under them. The model's pressure is the mean over a
 cell's area; its interval is that of the smallest region around the cell, in proportion to the pressures.
@@ -43,12 +43,12 @@ from ...socket.wrapping import wrap_sheet
 from ...study import Study
 from ...study.socket import MeasuredTable
 from ..engine.context import Context
-from ..engine.store import ResultFiles, write_result
+from ..engine.store import write_result
 from ..simulation.loading import LimbAxis
 from .shape import build_loadable_socket, build_socket, mesh_edge_mm, place_errors
 from .simulation import SocketLimb, SocketModel
 
-NAME, MODEL = "sensors", "model"  # the stage, and its file with a packed `SocketModel`
+NAME = "sensors"
 OFF, ALL = "off the socket", "all"  # a cell that the face does not reach, and cells of any region
 # Points of a disc of radius 1, and their weights: exact to the fifth order (Abramowitz and Stegun, 25.4.61).
 _TURNS = np.radians(60.0 * np.arange(6))
@@ -115,14 +115,13 @@ def run_sensors(context: Context, folder: Path) -> None:
 
     The mesh of an interrupted run is kept. Errors as `build_loadable_socket` and `place_sensors`.
     """
-    study, limb = context.study, SocketLimb.from_context(context, NAME)
+    study, limb = context.study, SocketLimb.from_store(context.study, context.store)
     socket = build_loadable_socket(study, limb.anatomy, limb.outer.skin)
     tables, outer = study.socket.measured, limb.outer.skin
     sensors = [place_sensors(study, table, socket, limb.anatomy, outer) for table in tables]
     for one in sensors:
         context.tell(NAME, 0, 0, f"{one.name}: {one.words}")
-    mesh, facts = limb.mesh(folder, socket, partial(context.tell, NAME, 0, 0))
-    ResultFiles(folder).put(MODEL, limb.build_model(socket, mesh).pack())
+    _, facts = limb.mesh(folder, socket, partial(context.tell, NAME, 0, 0))
     limb.write_face(socket, folder / "socket-face.vtp")
     content = SensorsResult(edge_mm=mesh_edge_mm(study, socket), mesh=facts, sensors=sensors)
     write_result(folder / f"{NAME}.json", content)

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,16 +40,14 @@ from ...results.socket import LinerFacts
 from ...socket import Socket
 from ...socket.landmarks import SkinRegion, find_directions, find_load_point
 from ...study import Study
-from ..engine.context import Context
 from ..engine.digests import code_digest, compute_digest
-from ..engine.store import Made, ResultFiles
+from ..engine.store import Made, ResultFiles, Store
 from ..limb.mesh import is_meshed, keep_mesh, mesh_settings, read_mesh_facts, read_stored_depth
 from ..simulation.limb_geometry import find_fibre_directions
 from .intervals import ParameterSpread, SimulationSpread, spread_to_facts
 from .shape import LINER, build_regions, find_covered_regions, load_of, mesh_edge_mm
 
 MESH = "limb.vtu"
-REGION = "region."  # in the name of a packed mask
 BELOW_BRIM_MM = 15.0  # edges are short from so far above the brim on
 FAR, GROWTH, FLATNESS = 3.5, 0.5, 1.6  # edges near the proximal cut over those below, and how elements grow
 
@@ -70,16 +68,15 @@ class SocketLimb:
     fibres: tuple[tuple[str, Direction], ...]
 
     @classmethod
-    def from_context(cls, context: Context, name: str) -> SocketLimb:
-        """That of a study whose surfaces are stored; ``name`` is the experiment's, for its progress."""
-        study, surfaces = context.study, context.store["surfaces"]
-        anatomy, thickness = load_anatomy(surfaces), study.socket.liner.thickness_mm
-        outer, depth = anatomy, read_stored_depth(surfaces, anatomy, mesh_settings(study))
+    def from_store(cls, study: Study, store: Store) -> SocketLimb:
+        """That of a study whose surfaces are stored."""
+        surfaces, thickness = store["surfaces"], study.socket.liner.thickness_mm
+        outer = anatomy = load_anatomy(surfaces)
+        depth = read_stored_depth(surfaces, anatomy, mesh_settings(study))
         if thickness:
-            context.tell(name, 0, 0, f"a liner of {thickness:g} mm around the limb")
             outer, depth = build_liner_surface(anatomy, thickness, depth)
-        regions, fibres = build_regions(study, anatomy), find_fibre_directions(context)
-        return cls(study, anatomy, outer, depth, regions, fibres)
+        fibres = find_fibre_directions(study, store.results)
+        return cls(study, anatomy, outer, depth, build_regions(study, anatomy), fibres)
 
     def mesh(self, folder: Path, brim: Socket, report: Callable[[str], None]) -> tuple[Mesh, MeshMeasures]:
         """The whole limb's mesh and its facts; that of an interrupted run is kept."""
@@ -172,27 +169,6 @@ class SocketModel:
             *(face.points, face.faces, face.clear, asdict(self.fit), self.faces, self.fibres),
             *(compute_extensions_digest(study.extensions), code_digest(solve_run)),
         )
-
-    def pack(self) -> Made:
-        """Facts and arrays of all but the study and the mesh, for `unpack`."""
-        face = {key: getattr(self.face, key) for key in ("points", "faces", "clear", "brim")}
-        regions = {f"{REGION}{name}": mask for name, mask in self.faces.items()}
-        return {"fit": asdict(self.fit), "fibres": self.fibres}, face | regions
-
-    @classmethod
-    def unpack(cls, study: Study, mesh: Mesh, made: Made) -> Self:
-        """The model of a ``study`` whose limb has this ``mesh``, from what `pack` made."""
-        facts, arrays = made[0], dict[str, Any](made[1])
-        faces = {key.removeprefix(REGION): arrays.pop(key) for key in list(arrays) if REGION in key}
-        loads = tuple(Load(**_to_arrays(load)) for load in facts["fit"].pop("loads"))
-        fit = SocketFit(**_to_arrays(facts["fit"]), loads=loads)
-        fibres = tuple((tissue, way if way == "flow" else tuple(way)) for tissue, way in facts["fibres"])
-        return cls(study, mesh, Socket(**arrays), fit, faces, fibres)
-
-
-def _to_arrays(facts: Mapping[str, Any]) -> dict[str, Any]:
-    """Facts with their lists of three numbers as arrays (3,)."""
-    return {key: np.array(one) if isinstance(one, list) else one for key, one in facts.items()}
 
 
 @dataclass(frozen=True, eq=False)

@@ -78,7 +78,7 @@ def run_socket(
     samples : draws from it that are simulated too, and more friction; the intervals then count what
         derivatives miss.
     """
-    study, limb = context.study, SocketLimb.from_context(context, NAME)
+    study, limb = context.study, SocketLimb.from_store(context.study, context.store)
     socket = build_loadable_socket(study, limb.anatomy, limb.outer.skin)
     write_surface(folder / "socket.stl", socket.surface)
     mesh, facts = limb.mesh(folder, socket, partial(context.tell, NAME, 0, 0))
