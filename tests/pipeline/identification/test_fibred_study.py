@@ -53,7 +53,7 @@ def test_their_direction_decides_the_calibration(tmp_path):
 
 
 def test_the_axis_is_the_normal_of_the_proximal_cut(context):
-    assert find_fibre_directions(study, context.results) == (("muscle", (1.0, 0.0, 0.0)),)
+    assert find_fibre_directions(context.study, context.results) == (("muscle", (1.0, 0.0, 0.0)),)
     along = study_of(context.study.folder)
     axis = find_fibre_directions(along, context.results)
     assert axis == (("muscle", (0.0, 0.0, -1.0)),)
