@@ -10,19 +10,20 @@ import secrets
 import select
 import socket
 import time
-import tomllib
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Protocol, TypeVar
 
-from pydantic import BaseModel, ValidationError
+from pydantic import ValidationError
 
 from ..errors import InputError, RunError
 from ..extensions import import_extra
+from ..study.loading import read_toml
+from ..study.tables import TomlTable
 from . import line_protocol as wire
 
-Model = TypeVar("Model", bound=BaseModel)
+Model = TypeVar("Model", bound=TomlTable)
 DEFAULT_PORT = 7714
 DEFAULT_ADDRESS = f"tcp://127.0.0.1:{DEFAULT_PORT}"
 BAUD = 2_000_000
@@ -318,10 +319,8 @@ def read_model(model: type[Model], file: Path, missing: str, wrong: str) -> Mode
     """
     if not file.is_file():
         raise InputError("no such file", file=file, remedy=missing)
-    try:  # "-sig": editors on Windows may begin a file with a mark
-        return model.model_validate(tomllib.loads(file.read_text(encoding="utf-8-sig")))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise InputError(f"not valid TOML: {error}", file=file) from None
+    try:
+        return model.model_validate(read_toml(file))
     except ValidationError as error:
         first = error.errors()[0]
         place = ".".join(str(part) for part in first["loc"]) or None

@@ -14,10 +14,11 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
 from ..errors import InputError, RunError
 from ..extensions import import_extra
+from ..study.tables import Positive, TomlTable
 from . import line_protocol as wire
 from .device import Link, connect, parse_address, read_model
 from .line_protocol import Flags, Sample
@@ -38,13 +39,9 @@ ZABER = {
     "speed_factor": 1.6384,
 }
 NOT_HOMED = ("WR", "WH")  # flags of a stage that does not know where it is
-Finite = Annotated[float, Field(allow_inf_nan=False)]
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
 
-class _Table(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
+class _Table(TomlTable):
     address: str
     timeout_ms: Positive = 50.0
 
@@ -65,9 +62,9 @@ class StageTable(_Table):
     move: str
     stop: str
     answers: bool = True
-    mm_per_unit: Finite = 1.0
+    mm_per_unit: float = 1.0
     speed_factor: Positive = 1.0
-    home: Finite = 0.0
+    home: float = 0.0
     stroke_mm: Positive
 
     @model_validator(mode="before")
@@ -81,16 +78,14 @@ class ForceTable(_Table):
     """The force sensor: ``read`` is answered by a number; positive when the limb pushes back."""
 
     read: str
-    N_per_unit: Finite = 1.0
+    N_per_unit: float = 1.0
     range_N: Positive
     resolution_N: Positive
-    noise_N: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.0
+    noise_N: Annotated[float, Field(ge=0)] = 0.0
 
 
-class RigTable(BaseModel):
+class RigTable(TomlTable):
     """The file of a rig."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,39}$")]
     rate_hz: Annotated[int, Field(ge=20, le=500)] = 100

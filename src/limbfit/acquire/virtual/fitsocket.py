@@ -11,17 +11,17 @@ from pathlib import Path
 from typing import Annotated, Literal, get_args
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
+from ...study.tables import TomlTable
 from .. import line_protocol as wire
 from ..device import read_model
 from ..line_protocol import PINS, RATE_HZ, Flags, Sample
 from ..safety import FROZEN_S, FROZEN_SAMPLES, Guard, SafetyLimits
-from .parts import STROKE_MM, Motors, Sensors, VirtualLimb
+from .parts import STEP_S, STROKE_MM, Motors, Sensors, VirtualLimb
 
-STEP_US = 1000
+STEP_US = round(1e6 * STEP_S)
 STEPS_PER_SAMPLE = 1_000_000 // RATE_HZ // STEP_US  # steps per sample
-RETRACT_MM_S = 100.0
 # Built in: no session's limits go beyond them.
 MAX_FORCE_MN = 45_000
 MAX_SPEED_UM_S = 12_000
@@ -44,10 +44,8 @@ Kind = Literal[
 FAULT_KINDS: tuple[str, ...] = get_args(Kind)
 
 
-class Fault(BaseModel):
+class Fault(TomlTable):
     """One fault; its time counts from the session's start, or from its first entry into a phase."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     kind: Kind
     at_s: Annotated[float, Field(ge=0, le=1e5)] = 0.0
@@ -57,9 +55,7 @@ class Fault(BaseModel):
     value: Annotated[float, Field(ge=-100, le=10_000)] = 0.0
 
 
-class _FaultFile(BaseModel):
-    model_config = ConfigDict(extra="forbid")
-
+class _FaultFile(TomlTable):
     faults: tuple[Fault, ...]
 
 
@@ -107,8 +103,8 @@ class VirtualFitSocket:
     ) -> None:
         self.limb, self.clock = limb, clock
         self._random = np.random.default_rng(seed)
-        self.motors = Motors(STEP_US / 1e6)
-        self.sensors = Sensors(self._random, STEP_US / 1e6)
+        self.motors = Motors()
+        self.sensors = Sensors(self._random)
         self.faults = FaultClock(faults)
         self._serial = f"V{seed:06d}"[:40]
         self.time_us = 0
@@ -356,7 +352,7 @@ class VirtualFitSocket:
         if not self.stopped:
             self.stopped, self._stopped_us = code, self.time_us
         self._halt_forces_mN = [0] * PINS
-        self.motors.retract(RETRACT_MM_S)
+        self.motors.retract()
 
     def _check_home(self) -> bytes:
         """Bring all pins home after a stop, again and again; report those that stay out too long."""
@@ -365,7 +361,7 @@ class VirtualFitSocket:
         if self.is_home:
             self._given_up = False
             return b""
-        self.motors.retract(RETRACT_MM_S)
+        self.motors.retract()
         if self._given_up or self.time_us - self._stopped_us < MAX_HOMING_US:
             return b""
         self._given_up = True

@@ -36,6 +36,7 @@ _SMOOTHING_WEIGHT = 0.02  # weight on differences of neighbouring slopes
 _CONTACT_FORCE_SHARE = 1e-3  # of the largest force
 STROKE_MM = 60.0
 ACCELERATION = 1000.0  # mm/s2, when driven
+RETRACT_MM_S = 100.0
 BRAKING = 8000.0  # mm/s2, when stopped or halted
 PLAY_MM = 0.02
 ARRIVAL_TOLERANCE_MM = 0.001
@@ -150,14 +151,13 @@ class VirtualLimb:
 
 
 class Motors:
-    """14 motors in steps of ``step_s``: trapezoids of speed towards targets.
+    """14 motors in steps of ``STEP_S``: trapezoids of speed towards targets.
 
     ``position_mm``, ``speed_mm_s``: (14,) of the motors, positive towards the limb; ``head_mm``: (14,) of the
     heads; ``driving``: (14,) whether a motor is under distance.
     """
 
-    def __init__(self, step_s: float) -> None:
-        self.step_s = step_s
+    def __init__(self) -> None:
         self.position_mm, self.speed_mm_s, self.head_mm = np.zeros(PINS), np.zeros(PINS), np.zeros(PINS)
         self.driving = np.zeros(PINS, dtype=bool)
         self._target, self._speed = np.zeros(PINS), np.zeros(PINS)
@@ -170,10 +170,10 @@ class Motors:
     def halt(self, k: int) -> None:
         self.driving[k] = False
 
-    def retract(self, speed_mm_s: float) -> None:
+    def retract(self) -> None:
         """Everything home, as hard as can be."""
         self.driving[:] = self.position_mm > ARRIVAL_TOLERANCE_MM
-        self._target[:], self._speed[:], self._acceleration[:] = 0.0, speed_mm_s, BRAKING
+        self._target[:], self._speed[:], self._acceleration[:] = 0.0, RETRACT_MM_S, BRAKING
 
     def find_withdrawn(self) -> Mask:
         """Withdrawn, and not about to leave."""
@@ -185,13 +185,13 @@ class Motors:
         braking = np.where(self.driving, self._acceleration, BRAKING)
         reach = np.sqrt(2 * braking * np.abs(distance))
         target_speed = np.where(self.driving, np.sign(distance) * np.minimum(self._speed, reach), 0.0)
-        change = braking * self.step_s
+        change = braking * STEP_S
         self.speed_mm_s += np.minimum(np.maximum(target_speed - self.speed_mm_s, -change), change)
         if not powered:
             self.speed_mm_s[:] = 0.0
         for k in jammed:
             self.speed_mm_s[k] = 0.0
-        moved = self.speed_mm_s * self.step_s
+        moved = self.speed_mm_s * STEP_S
         arrives = (
             self.driving
             & (np.abs(distance) <= np.maximum(np.abs(moved), ARRIVAL_TOLERANCE_MM))
@@ -223,10 +223,10 @@ class Sensors:
     _area = 8.854 * 400.0  # fF mm: eps0 times the head's 400 mm2
     _film_mm = 0.25
 
-    def __init__(self, random: np.random.Generator, step_s: float) -> None:
+    def __init__(self, random: np.random.Generator) -> None:
         self._random = random
         self._zero = random.normal(0, 40, PINS)
-        self._drift_step_mN = self._drift_mN * np.sqrt(step_s)
+        self._drift_step_mN = self._drift_mN * np.sqrt(STEP_S)
         self._frozen_forces_mN: dict[int, int] = {}
         self._noise_blocks: list[Array] = []
 

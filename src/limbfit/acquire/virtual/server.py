@@ -55,7 +55,6 @@ class Endpoint:
     listener: socket.socket | None = None
     pty: PtyLink | None = None
     stopping: bool = False
-    refused: int = 0  # connections beside the one that holds the device
 
     @classmethod
     def listen_on_port(cls, host: str, port: int) -> Endpoint:
@@ -183,7 +182,6 @@ class _Server:
             return
         if self.link is not None:
             connection.close()
-            self.serving.refused += 1
             return
         self.link = TcpLink(connection)
         self.last_heard_s = time.monotonic()
