@@ -4,6 +4,7 @@ The synthetic record is a power-law solid with quasi-linear relaxation, F = a d^
 G(t) = 1 + gamma exp(-t / tau): it starts with slack, is pushed in at constant speed and drawn back.
 """
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -41,25 +42,19 @@ def record(
     wait=0.0,
     seed=0,
 ):
-    """A record, and its force without noise as a function of time."""
+    """A record in and out, and its force without noise as a function of time."""
     travel = slack + depth
-    fine = np.arange(0, wait + 2 * travel / speed, 1e-3)
-    moved = speed * np.clip(fine - wait, 0, None)
-    path = np.minimum(moved, 2 * travel - moved)
-    force = relaxing(fine, path - slack, p)
-    time = np.arange(0, fine[-1], 1 / rate)
-    rng = np.random.default_rng(seed)
-    displacement = np.interp(time, fine, path) + noise_mm * rng.standard_normal(time.size)
-    clean = np.interp(time, fine, force)
-    noisy = clean + offset + noise_N * rng.standard_normal(time.size)
-    return Trace(time, displacement, noisy), lambda t: np.interp(t, fine, force)
+    corners_s = [0.0, wait, wait + travel / speed, wait + 2 * travel / speed]
+    how = {"p": p, "rate": rate, "noise_N": noise_N, "noise_mm": noise_mm, "seed": seed}
+    trace, truth = path_record(corners_s, [0.0, 0.0, travel, 0.0], slack, **how)
+    return replace(trace, force_N=trace.force_N + offset), truth
 
 
-def path_record(corners_s, corners_mm, slack=0.4, rate=500.0, noise_N=0.03, noise_mm=0.005, seed=0):
+def path_record(corners_s, corners_mm, slack=0.4, p=1.3, rate=500.0, noise_N=0.03, noise_mm=0.005, seed=0):
     """A record along a broken line of displacement, and its force without noise as a function of time."""
     fine = np.arange(0, corners_s[-1], 1e-3)
     path = np.interp(fine, corners_s, corners_mm)
-    force = relaxing(fine, path - slack)
+    force = relaxing(fine, path - slack, p)
     time = np.arange(0, fine[-1], 1 / rate)
     rng = np.random.default_rng(seed)
     displacement = np.interp(time, fine, path) + noise_mm * rng.standard_normal(time.size)

@@ -75,31 +75,26 @@ def spiked(values, size, seed=3, per_mille=1.0):
     return spikes, places
 
 
-@pytest.mark.parametrize("size", [1.0, 500.0])
-def test_spikes_are_taken_out_and_counted(size):
+@pytest.mark.parametrize(
+    ("column", "size", "most"),
+    [("force_N", 1.0, 6 * NOISE_N), ("force_N", 500.0, 6 * NOISE_N), ("displacement_mm", 2.0, 0.05)],
+)
+def test_spikes_are_taken_out_and_counted(column, size, most):
     trace, clean = record()
-    force, places = spiked(trace.force_N, size)
-    found = interpret_record(replace(trace, force_N=force))
+    values, places = spiked(getattr(trace, column), size)
+    found = interpret_record(replace(trace, **{column: values}))
     assert kinds(found) == ["spikes"]
     assert found.warnings[0].evidence["spikes"] == len(places)
-    assert f"{len(places)} of {len(force)} samples of the force" in found.warnings[0].what
-    assert np.abs(found.trace.force_N - clean).max() < 6 * NOISE_N
-    changed = found.trace.force_N != force
-    assert np.array_equal(np.flatnonzero(changed), np.sort(places))
-
-
-def test_spikes_of_the_displacement_are_taken_out():
-    trace, _ = record()
-    moved, _ = spiked(trace.displacement_mm, 2.0)
-    found = interpret_record(replace(trace, displacement_mm=moved))
-    assert "displacement" in found.warnings[0].what
-    assert np.abs(found.trace.displacement_mm - trace.displacement_mm).max() < 0.05
+    assert f"{len(places)} of {len(values)} samples of the {column.split('_')[0]}" in found.warnings[0].what
+    mended = getattr(found.trace, column)
+    truth = clean if column == "force_N" else trace.displacement_mm
+    assert np.abs(mended - truth).max() < most
+    assert np.array_equal(np.flatnonzero(mended != values), np.sort(places))
 
 
 def test_one_spike_in_a_short_record_is_taken_out():
     trace, clean = record()
-    some = slice(None, None, len(clean) // 60)
-    short = Trace(trace.time_s[some], trace.displacement_mm[some], trace.force_N[some])
+    short = trace.select(slice(None, None, len(clean) // 60))
     force = short.force_N.copy()
     force[30] += 5.0
     found = interpret_record(replace(short, force_N=force))
@@ -119,21 +114,20 @@ def test_a_broken_cable_is_refused():
 def test_a_corner_is_no_spike():
     """At 10 Hz a peak is three samples."""
     trace, clean = record()
-    few = Trace(trace.time_s[::50], trace.displacement_mm[::50], clean[::50])
+    few = replace(trace, force_N=clean).select(slice(None, None, 50))
     assert interpret_record(few).trace is few
 
 
 # --- in contact
 
 
-def cut(trace, at_mm, zeroed=False):
+def cut(trace, at_mm):
     """The record as if it had been started with the indenter ``at_mm``, and ended there."""
     top = int(trace.displacement_mm.argmax())
     start = int(np.argmax(trace.displacement_mm >= at_mm))
     end = top + int(np.argmax(trace.displacement_mm[top:] <= at_mm))
-    rows = slice(start, end)
-    force = trace.force_N[rows] - (trace.force_N[start] if zeroed else 0.0)
-    return Trace(trace.time_s[rows] - trace.time_s[start], trace.displacement_mm[rows] - at_mm, force)
+    shifted = Trace(trace.time_s - trace.time_s[start], trace.displacement_mm - at_mm, trace.force_N)
+    return shifted.select(slice(start, end))
 
 
 @pytest.mark.parametrize("at_mm", [2.5, 4.5])
@@ -145,9 +139,7 @@ def test_a_record_that_begins_in_full_contact_is_refused(at_mm):
 def test_a_sensor_that_was_zeroed_in_contact_is_refused():
     trace, _ = record()
     start = int(np.argmax(trace.displacement_mm >= 2.5))
-    pressed = Trace(
-        trace.time_s[start:], trace.displacement_mm[start:], trace.force_N[start:] - trace.force_N[start]
-    )
+    pressed = replace(trace, force_N=trace.force_N - trace.force_N[start]).select(slice(start, None))
     with pytest.raises(TraceError, match=r"begins in contact: .* N when it is released"):
         interpret_record(pressed)
 

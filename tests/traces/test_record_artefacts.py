@@ -40,8 +40,7 @@ def assert_within(found, touch_down_mm=SLACK_MM, most_sd_mm=0.6):
 
 
 def without(trace, start_s, end_s):
-    kept = (trace.time_s < start_s) | (trace.time_s > end_s)
-    return Trace(trace.time_s[kept], trace.displacement_mm[kept], trace.force_N[kept])
+    return trace.select((trace.time_s < start_s) | (trace.time_s > end_s))
 
 
 @pytest.mark.parametrize(("share", "before_noise"), [(0.6, True), (0.95, True), (0.8, False)])
@@ -134,14 +133,12 @@ def test_a_sensor_that_was_zeroed_in_contact(sound, to_the_end):
     trace, clean = sound
     start = int(np.argmax(trace.displacement_mm >= SLACK_MM + 0.15))
     end = None if to_the_end else int(np.flatnonzero(trace.displacement_mm > SLACK_MM + 0.15)[-1])
-    rows = slice(start, end)
-    found = interpret_record(
-        Trace(
-            trace.time_s[rows] - trace.time_s[start],
-            trace.displacement_mm[rows] - trace.displacement_mm[start],
-            trace.force_N[rows] - clean[start],
-        )
+    shifted = Trace(
+        trace.time_s - trace.time_s[start],
+        trace.displacement_mm - trace.displacement_mm[start],
+        trace.force_N - clean[start],
     )
+    found = interpret_record(shifted.select(slice(start, end)))
     remark = only(found, "start")
     assert remark.evidence["preload_N"] == pytest.approx(0.12, abs=0.05)
     assert "as if it had been zeroed in contact" in remark.what
@@ -226,7 +223,7 @@ def test_rounded_times_with_a_gap_stay_where_they_are(sound):
 def test_rows_that_are_there_twice_are_left_out(sound):
     trace, _ = sound
     rows = np.sort(np.r_[np.arange(len(trace.time_s)), [5, 400, 400, 2000]])
-    doubled = Trace(trace.time_s[rows], trace.displacement_mm[rows], trace.force_N[rows])
+    doubled = trace.select(rows)
     check_trace(doubled)
     found = interpret_record(doubled)
     assert only(found, "rows").evidence["doubled_rows"] == 4
@@ -291,7 +288,4 @@ def test_other_movements_have_no_remarks(movement):
 def test_samples_that_are_missing_at_random_are_no_gap(sound):
     trace, _ = sound
     kept = np.random.default_rng(0).random(len(trace.time_s)) > 0.3
-    assert (
-        interpret_record(Trace(trace.time_s[kept], trace.displacement_mm[kept], trace.force_N[kept])).warnings
-        == ()
-    )
+    assert interpret_record(trace.select(kept)).warnings == ()

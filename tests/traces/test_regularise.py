@@ -8,7 +8,7 @@ import pytest
 from made_records import OPENLIMB, needs_openlimb, path_record, record
 from scipy.interpolate import make_smoothing_spline
 
-from limbfit.traces import Trace, find_touch_down, read_trace, regularise
+from limbfit.traces import find_touch_down, read_trace, regularise
 from limbfit.traces.regularise import _fit_spline
 
 
@@ -109,8 +109,7 @@ def test_resampling_keeps_corners_peak_and_ends():
 
 def test_a_record_that_ends_at_its_peak_is_loading_only():
     trace, _ = record()
-    half = trace.time_s < 5.4 / 0.96
-    trace = Trace(trace.time_s[half], trace.displacement_mm[half], trace.force_N[half])
+    trace = trace.select(trace.time_s < 5.4 / 0.96)
     curve = regularise(trace, find_touch_down(trace))
     assert np.isnan(curve.speed_unload_mm_s)
     assert curve.peak_index == len(curve.time_s) - 1

@@ -74,10 +74,10 @@ def mend_times(trace: Trace) -> tuple[Trace, list[TraceWarning]]:
         return trace, []
     twice = same & np.r_[False, (np.diff(trace.displacement_mm) == 0.0) & (np.diff(trace.force_N) == 0.0)]
     if np.array_equal(twice, same) and count < _MAX_REPEATED * n:
-        kept = Trace(time[~same], trace.displacement_mm[~same], trace.force_N[~same], trace.notes)
         what = f"{count} of {n} rows are there twice and were left out once"
         cause = "an export that repeats rows"
-        return kept, [TraceWarning("rows", what, cause, "check the export", {"doubled_rows": float(count)})]
+        numbers = {"doubled_rows": float(count)}
+        return trace.select(~same), [TraceWarning("rows", what, cause, "check the export", numbers)]
     size = float(np.median(np.diff(time[~same])))
     spread = replace(trace, time_s=_spread_times(time, same, size))
     what = (

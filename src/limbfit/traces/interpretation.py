@@ -122,7 +122,7 @@ def _find_touch_down(trace: Trace, line: BrokenLine, touch_down_s: float | None,
         return find_touch_down(trace, line)
     risen = trace.force_N - measure_start_force(trace)
     most = max(int(np.argmax(risen >= _RISE_SHARE * risen.max())), 2)
-    return find_touch_down(Trace(trace.time_s[:most], trace.displacement_mm[:most], trace.force_N[:most]))
+    return find_touch_down(trace.select(slice(most)))
 
 
 def _remove_spikes(trace: Trace) -> tuple[Trace, list[TraceWarning]]:

@@ -6,14 +6,14 @@ that is not known is refused.
 
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from scipy.ndimage import median_filter
 
-from ..arrays import Array
+from ..arrays import Array, Indices, Mask
 from ..errors import TraceError, add_location
 from .formats import TIME, ColumnTable, Row, is_number, read_table
 from .numerics import average_in_bins, estimate_noise_level
@@ -64,6 +64,11 @@ class Trace:
     displacement_mm: Array
     force_N: Array
     notes: tuple[str, ...] = ()
+
+    def select(self, rows: Mask | Indices | slice) -> Self:
+        """The samples of some rows alone."""
+        values = {name: getattr(self, name)[rows] for name in COLUMNS}
+        return replace(self, **values)
 
 
 @dataclass(frozen=True)
