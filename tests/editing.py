@@ -1,6 +1,21 @@
-"""Changes of a study's file, as a user makes them between two commands."""
+"""Studies and records as a user writes and changes them, and what a change makes stale."""
 
+from collections.abc import Callable, Sequence
 from pathlib import Path
+
+import numpy as np
+
+from limbfit.arrays import Array
+from limbfit.pipeline.commands.run import compute_keys
+from limbfit.study import Study, load_study
+
+
+def write_study(folder: Path, text: str, files: Sequence[str] = ("skin.stl", "1.csv")) -> Study:
+    """The study of a text; the files that it names are there, if only as empty ones."""
+    for name in files:
+        (folder / name).touch()
+    (folder / "study.toml").write_text(text, encoding="utf-8")
+    return load_study(folder)
 
 
 def edit(study: Path, old: str, new: str) -> None:
@@ -14,3 +29,16 @@ def edit(study: Path, old: str, new: str) -> None:
 def append(study: Path, text: str) -> None:
     with (study / "study.toml").open("a", encoding="utf-8") as stream:
         stream.write(text)
+
+
+def rewrite(record: Path, change: Callable[[Array], Array]) -> None:
+    """Change the table of a record: times, displacements and forces in columns."""
+    table = np.loadtxt(record, delimiter=",", skiprows=1)
+    header = "time_s,displacement_mm,force_N"
+    np.savetxt(record, change(table), delimiter=",", header=header, comments="")
+
+
+def list_stale(before: Study, after: Study) -> set[str]:
+    """The stages of a study that are others in another study."""
+    then, now = compute_keys(before), compute_keys(after)
+    return {stage for stage in then if then[stage] != now[stage]}

@@ -7,11 +7,13 @@ from pathlib import Path
 
 import numpy as np
 
+from editing import write_study
 from limbfit.anatomy.surfaces.surfaces import Anatomy, save_anatomy
 from limbfit.anatomy.surfaces.triangles import Surface
+from limbfit.arrays import Array
 from limbfit.bench.timing import build_block_model
 from limbfit.execution import SerialExecutor
-from limbfit.indentation import Parameters, SimulationJob, SiteModel, simulate
+from limbfit.indentation import Parameters, Simulation, SimulationJob, SiteModel, simulate
 from limbfit.mesh import Mesh, boundary_faces, to_tet10, write_vtu
 from limbfit.mesh.cells import SIX_TETS, build_boxes
 from limbfit.phantom.robot import Ramp, record
@@ -19,7 +21,7 @@ from limbfit.pipeline.engine.context import Context
 from limbfit.pipeline.engine.store import COARSE, Store, write_json
 from limbfit.pipeline.records.traces import run_traces
 from limbfit.pipeline.simulation.limb_geometry import find_fibre_directions
-from limbfit.study import SolverTable, Study, load_study
+from limbfit.study import SolverTable, Study
 from tetrahedra import turn_upright
 
 TISSUES = ("skin", "fat", "muscle")
@@ -53,11 +55,8 @@ position = [0.0, 0.0, 0.0]
 
 def block_study(folder: Path, material: str, more: str = "", site: str = "") -> Study:
     """The study of one block, by its ``[material]``, what stands before its site ``a``, and more of that."""
-    for name in ("skin.stl", "a.csv"):
-        (folder / name).touch()
     text = BLOCK_STUDY.format(material=material, more=more, site=site)
-    (folder / "study.toml").write_text(text, encoding="utf-8")
-    return load_study(folder)
+    return write_study(folder, text, ("skin.stl", "a.csv"))
 
 
 BLOCK_SITE = """
@@ -71,13 +70,10 @@ position = [0.0, 0.0, 0.0]
 
 def blocks_study(folder: Path, text: str, sites: Mapping[str, bool]) -> Study:
     """The study of ``text`` and ``sites``, which are fitted or not; records that are there stay."""
-    for name in ("skin.stl", *(f"{name}.csv" for name in sites)):
-        (folder / name).touch()
     text += "".join(
         BLOCK_SITE.format(name=name, fitted=str(fitted).lower()) for name, fitted in sites.items()
     )
-    (folder / "study.toml").write_text(text, encoding="utf-8")
-    return load_study(folder)
+    return write_study(folder, text, ("skin.stl", *(f"{name}.csv" for name in sites)))
 
 
 def block_context(study: Study, truth: Parameters) -> Context:
@@ -176,6 +172,19 @@ def store_blocks(
     write_json(store["sites"] / "sites.json", {"sites": places})
     run_traces(Context(study, store, SerialExecutor(), lambda event: None), store["traces"])
     return store
+
+
+def check_derivative(job: SimulationJob, found: Simulation, step: Array, share: float) -> None:
+    """The derivative of a job's force along a ``step`` of its parameters is a central difference.
+
+    To a ``share`` of the largest change. ``found`` is the job's simulation.
+    """
+    flat = np.array(job.parameters)
+    ends = [replace(job, parameters=tuple(end), sensitivities=False) for end in (flat + step, flat - step)]
+    ahead, back = (simulate(end).force_N for end in ends)
+    change = (ahead - back) / 2.0
+    assert found.jacobian is not None
+    np.testing.assert_allclose(found.jacobian @ step, change, atol=share * np.abs(change).max())
 
 
 def _write_record(study: Study, model: SiteModel, truth: Parameters, random: np.random.Generator) -> None:

@@ -6,13 +6,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from editing import edit, list_stale
+from layered import check_derivative
 from limbfit.errors import ProblemError, StudyError
 from limbfit.execution import SerialExecutor
 from limbfit.febio import read_feb, to_problem
 from limbfit.indentation import SimulationJob, SiteModel, simulate
 from limbfit.pipeline.commands.check import check_study
 from limbfit.pipeline.commands.other_solvers import export_study
-from limbfit.pipeline.commands.run import compute_keys, run_study
+from limbfit.pipeline.commands.run import run_study
 from limbfit.pipeline.engine.context import Context
 from limbfit.pipeline.engine.store import Store
 from limbfit.pipeline.limb.mesh import build_coarse_settings, mesh_settings
@@ -45,15 +47,11 @@ def test_the_table_alone_turns_them_on(tmp_path):
 
 
 def test_their_force_decides_simulations_and_their_width_the_mesh_too(tmp_path):
-    def decided(text: str) -> dict[str, str]:
-        return compute_keys(study_of(tmp_path, COARSE + text))
-
-    without, plain = decided(""), decided("[clamps]\n")
+    plain = study_of(tmp_path, COARSE + "[clamps]\n")
     later = {"calibrate", "predict", "report"}
-    assert {name for name in plain if plain[name] != without[name]} == {"mesh", *later}
+    assert list_stale(plain, study_of(tmp_path, COARSE)) == {"mesh", *later}
     for text, changed in (("force_N = 9.0", later), ("width_mm = 12.0", {"mesh", *later})):
-        other = decided(f"[clamps]\n{text}\n")
-        assert {name for name in plain if plain[name] != other[name]} == changed
+        assert list_stale(plain, study_of(tmp_path, f"{COARSE}[clamps]\n{text}\n")) == changed
 
 
 def test_the_mesh_is_no_coarser_than_they_are_wide_and_searched_as_a_whole(tmp_path):
@@ -75,24 +73,13 @@ def test_a_clamped_site_is_indented_from_where_its_skin_is_then(context):
     model = build_model(context, study.sites[0])
     start = np.array([study.material.get(tissue, "start")[key] for tissue, key in study.parameters])
     times = (0.0, 0.5 * model.knots_s[1], model.knots_s[1])  # the way in
-
-    def force(values: np.ndarray, sensitivities: bool = False, **changes):
-        starts = () if values is start else (tuple(start),)
-        posed = replace(model, **changes)
-        found = simulate(SimulationJob(posed, study.tissues, tuple(values), times, sensitivities, starts))
-        assert found.completed, found.reason
-        return found
-
-    found = force(start, True)
+    job = SimulationJob(model, study.tissues, tuple(start), times)
+    found, bare = (simulate(replace(job, model=one)) for one in (model, replace(model, clamps=None)))
+    assert found.completed, found.reason
     assert found.force_N[0] == 0.0
-    bare = force(start, clamps=None)
     assert np.abs(found.force_N - bare.force_N).max() > 0.03 * bare.force_N.max()
-    assert found.jacobian is not None
-    column = [f"{tissue}.{key}" for tissue, key in study.parameters].index("muscle.c_kPa")
-    step = 0.002 * start[column] * np.eye(len(start))[column]
-    difference = (force(start + step).force_N - force(start - step).force_N) / (2.0 * step[column])
-    slope = found.jacobian[:, column]
-    np.testing.assert_allclose(slope, difference, atol=1e-3 * np.abs(difference).max())
+    step = 0.002 * start * [name == ("muscle", "c_kPa") for name in study.parameters]
+    check_derivative(replace(job, starts=(tuple(start),)), found, step, 1e-3)
 
 
 @pytest.mark.slow
@@ -135,10 +122,8 @@ def test_the_check_says_how_many_hold_the_limb(commands_unasked, tmp_path):
     ],
 )
 def test_the_check_refuses_pins_with_the_study_s_file(commands_unasked, tmp_path, stated, what):
-    with pytest.raises(ProblemError) as caught:
+    with pytest.raises(ProblemError, match=f"study.toml: clamps: site 1: {what}"):
         check_study(study_of(tmp_path, f"{COARSE}[clamps]\n{stated}\n"))
-    assert f"study.toml: clamps: site 1: {what}" in str(caught.value)
-    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.slow
@@ -146,11 +131,9 @@ def test_pins_that_miss_are_refused_with_the_study_s_file(context):
     clamps = context.study.clamps
     assert clamps is not None
     above = context.study.model_copy(update={"clamps": clamps.model_copy(update={"levels_mm": (300.0,)})})
-    with pytest.raises(ProblemError) as caught:
+    what = "study.toml: clamps: site 1: no clamping pin meets the skin; give clamps.angles_degrees"
+    with pytest.raises(ProblemError, match=what):
         build_model(replace(context, study=above), above.sites[0])
-    told = str(caught.value)
-    assert "study.toml: clamps: site 1: no clamping pin meets the skin; give clamps.angles_degrees" in told
-    assert "\n" not in told
 
 
 @pytest.mark.parametrize(
@@ -166,18 +149,13 @@ def test_pins_that_miss_are_refused_with_the_study_s_file(context):
     ],
 )
 def test_what_cannot_be_is_said_in_a_line(tmp_path, text, what):
-    with pytest.raises(StudyError) as caught:
+    with pytest.raises(StudyError, match=f"study.toml: .*{what}"):
         study_of(tmp_path, f"{COARSE}{text}\n")
-    told = str(caught.value)
-    assert what in told
-    assert "study.toml" in told
-    assert "\n" not in told
 
 
 def test_a_record_under_force_is_not_clamped(tmp_path):
     (tmp_path / "1.csv").touch()
     text = "[clamps]\n[[records]]\nsite = '1'\nname = 'creep'\ntrace = '1.csv'\ncontrol = 'force'\n"
-    study = small_limb(tmp_path, f"{COARSE}{text}") / "study.toml"
-    study.write_text(study.read_text().replace("depth_mm = 3.0\n", ""))
+    edit(small_limb(tmp_path, f"{COARSE}{text}"), "depth_mm = 3.0\n", "")
     with pytest.raises(StudyError, match='1-creep has control = "force", which goes without clamps'):
         load_study(tmp_path)

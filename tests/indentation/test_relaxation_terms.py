@@ -4,13 +4,13 @@ from itertools import pairwise
 
 import pytest
 
+from editing import write_study
 from guide import identified
 from limbfit.errors import StudyError
 from limbfit.fe import OgdenQLV
 from limbfit.indentation import build_materials
 from limbfit.laws import LAWS, MAX_RELAXATION_TERMS, TissueLaw, is_ogden
 from limbfit.report.formats import format_symbol, format_unit
-from limbfit.study import load_study
 
 TEXT = """
 [study]
@@ -33,10 +33,7 @@ TRUTH = {"c_kPa": 6.0, "m": 5.0, "gamma1": 1.6, "tau1_s": 0.12, "gamma2": 0.9, "
 
 
 def study_of(folder, law="ogden-prony2", more=""):
-    for name in ("skin.stl", "1.csv"):
-        (folder / name).touch()
-    (folder / "study.toml").write_text(TEXT.format(law=law, more=more), encoding="utf-8")
-    return load_study(folder)
+    return write_study(folder, TEXT.format(law=law, more=more))
 
 
 @pytest.mark.parametrize("terms", range(1, MAX_RELAXATION_TERMS + 1))

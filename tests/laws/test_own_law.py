@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from editing import write_study
 from guide import from_the_guide, identified
 from limbfit import History, OgdenQLV, Problem, load_study
 from limbfit.errors import InputError
@@ -170,11 +171,8 @@ position = [0.0, -50.0, 10.0]
 
 def test_a_study_names_it_and_follows_its_file(tmp_path, file, law):
     assert law.moduli == ("a_kPa",)
-    for name in ("skin.stl", "1.csv"):
-        (tmp_path / name).write_text(name)
     shutil.copy(file, tmp_path / "yeoh.py")
-    (tmp_path / "study.toml").write_text(GIVEN)
-    study = load_study(tmp_path)
+    study = write_study(tmp_path, GIVEN)
     assert study.parameters[:4] == tuple(("skin", key) for key in TRUTH)
     assert study.material.start == {"a_kPa": 4.0, "b": 2.0, "gamma": 1.2, "tau_s": 1.0}
     assert study.material.upper["b"] == 10.0
@@ -183,18 +181,14 @@ def test_a_study_names_it_and_follows_its_file(tmp_path, file, law):
     with pytest.raises(InputError, match="tissue law 'yeoh' exists already"):
         load_study(tmp_path)  # one that is known here from another file
     assert compute_keys(study) != before
-    wrong = GIVEN.replace("b = 2.0", "c_kPa = 2.0")
     shutil.copy(file, tmp_path / "yeoh.py")
-    (tmp_path / "study.toml").write_text(wrong)
     with pytest.raises(InputError, match="c_kPa is no parameter of the law; they are a_kPa, b, gamma, tau_s"):
-        load_study(tmp_path)
+        write_study(tmp_path, GIVEN.replace("b = 2.0", "c_kPa = 2.0"))
 
 
 def test_a_socket_knows_it_in_a_process_that_has_read_no_study_and_follows_its_file(tmp_path, file):
-    for name in ("skin.stl", "1.csv", "limb.vtu"):
-        (tmp_path / name).write_text(name)
-    (tmp_path / "study.toml").write_text(GIVEN.replace("yeoh.py", str(file)))
-    study, corners = load_study(tmp_path), np.eye(3) + np.array([12.0, -80.0, 270.0])  # beside the limb
+    study = write_study(tmp_path, GIVEN.replace("yeoh.py", str(file)), ("skin.stl", "1.csv", "limb.vtu"))
+    corners = np.eye(3) + np.array([12.0, -80.0, 270.0])  # beside the limb
     socket = Socket(corners, np.array([[0, 1, 2]]), corners, np.arange(3))
     anatomy, mesh = limb_with_a_bone(), Mesh.from_arrays(np.eye(4, 3), [[0, 1, 2, 3]])
     mesh = replace(mesh, face_sets={"skin": np.array([[0, 1, 2]])})
@@ -217,12 +211,9 @@ print(model.build_laws({{"skin": {TRUTH}}})["skin"].parameters)"""
 
 
 def test_an_export_of_the_exponential_law_is_refused_at_once(tmp_path):
-    for name in ("skin.stl", "1.csv"):
-        (tmp_path / name).write_text(name)
     stated = GIVEN.replace('extensions = ["yeoh.py"]\n', "").replace('"yeoh"', f'"{FUNG}"')
-    (tmp_path / "study.toml").write_text(stated)
     with pytest.raises(InputError, match="Ogden"):
-        check_export(load_study(tmp_path), "feb")
+        check_export(write_study(tmp_path, stated), "feb")
 
 
 def test_an_extension_whose_change_is_taken_back_is_run_again(tmp_path):

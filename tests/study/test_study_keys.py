@@ -24,6 +24,7 @@ from keyed_studies import (
 )
 
 import limbfit
+from editing import list_stale
 from limbfit.pipeline.commands.experiments import EXPERIMENTS
 from limbfit.pipeline.commands.run import compute_keys
 from limbfit.pipeline.engine.provenance import Keys
@@ -59,25 +60,23 @@ def test_a_key_of_no_stage_is_read(key: str) -> None:
     assert key.rpartition(".")[2] in list_read(Path(limbfit.__file__).parent / READ[key])
 
 
-def list_stale(folder: Path, content: Mapping[str, Any], other: Mapping[str, Any]) -> set[str]:
-    """The stages of a study that are others in another study."""
-    then, now = (compute_keys(loaded(folder, one)) for one in (content, other))
-    return {stage for stage in then if then[stage] != now[stage]}
+def stale_in(folder: Path, content: Mapping[str, Any], other: Mapping[str, Any]) -> set[str]:
+    return list_stale(loaded(folder, content), loaded(folder, other))
 
 
 @pytest.mark.parametrize(("key", "value"), [("sites.1.region", "calf"), ("sites.1.fitted", True)])
 def test_what_a_site_is_called_or_used_for_is_no_reason_to_mesh_again(
     folder: Path, key: str, value: Any
 ) -> None:
-    stale = list_stale(folder, IMAGED, changed(IMAGED, key, value))
+    stale = stale_in(folder, IMAGED, changed(IMAGED, key, value))
     assert {"sites", "predict", "report"} <= stale
     assert "mesh" not in stale
-    assert "mesh" in list_stale(folder, IMAGED, changed(IMAGED, "sites.1.edge", [0.0, 1.0, 1.0]))
+    assert "mesh" in stale_in(folder, IMAGED, changed(IMAGED, "sites.1.edge", [0.0, 1.0, 1.0]))
 
 
 def test_meshes_that_are_made_are_kept_when_the_mesher_is_given_more_time(folder: Path) -> None:
     """The remedy that is named where one mesh of many takes too long."""
-    assert list_stale(folder, GIVEN, changed(GIVEN, "mesh.time_limit_s", 1200.0)) == {
+    assert stale_in(folder, GIVEN, changed(GIVEN, "mesh.time_limit_s", 1200.0)) == {
         *("calibrate", "predict", "report")  # which does without a coarser mesh that takes too long
     }
 
@@ -96,8 +95,8 @@ def test_the_order_of_keys_makes_nothing_stale_and_that_of_sites_what_lists_them
     }
     turned["indenters"] = dict(reversed(tables["indenters"].items()))
     stated, other = ({**IMAGED, **each} for each in (tables, turned))
-    assert list_stale(folder, stated, other) == set()
-    assert "sites" in list_stale(folder, stated, {**stated, "sites": stated["sites"][::-1]})
+    assert stale_in(folder, stated, other) == set()
+    assert "sites" in stale_in(folder, stated, {**stated, "sites": stated["sites"][::-1]})
 
 
 def test_an_indenter_that_no_fitted_record_names_is_no_reason_to_identify_again(folder: Path) -> None:

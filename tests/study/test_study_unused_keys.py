@@ -221,8 +221,6 @@ def test_a_key_without_effect_is_refused(folder: Path, content: Any, changes: An
         content = changed(content, one, value)
     with pytest.raises(StudyError, match="without effect") as caught:
         loaded(folder, content)
-    told = str(caught.value)
-    assert "\n" not in told
     named = str(caught.value.place)
     assert ".".join(part for part in named.split(".") if part not in ("1", "2")) == key
     assert caught.value.remedy

@@ -221,9 +221,8 @@ def test_check_tells_what_was_mended_and_what_is_wrong_and_not_mended(study):
 
 def test_check_names_the_file_of_a_record_that_begins_in_contact(study):
     change(study, "1", lambda table: table[200:800])
-    with pytest.raises(InputError, match=r"1\.csv.*force_N: the record begins in contact") as caught:
+    with pytest.raises(InputError, match=r"1\.csv.*force_N: the record begins in contact"):
         checked(study)
-    assert "\n" not in str(caught.value)
 
 
 def test_check_says_that_a_record_has_loading_only(study):
@@ -264,9 +263,8 @@ def test_a_bulk_modulus_that_no_tissue_has_is_refused(study, ratio):
     settings(study, f"[material]\nkappa_ratio = {ratio}\n")
     with pytest.raises(
         StudyError, match=r"study\.toml: material\.kappa_ratio: give (10 or more|at most 10000)"
-    ) as caught:
+    ):
         load_study(study)
-    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize("table", ["mesh", "mesh.coarse"])
@@ -276,7 +274,6 @@ def test_a_mesh_of_billions_of_cells_is_refused(study, table):
         StudyError, match=r"study\.toml: mesh.*billion cells.* give edge_near_mm of 0\.\d+ or more"
     ) as caught:
         load_study(study)
-    assert "\n" not in str(caught.value)
     least = float(str(caught.value).split("edge_near_mm of ")[1].split()[0])
     text = (study / "study.toml").read_text()
     (study / "study.toml").write_text(text.replace("0.01", str(least)))

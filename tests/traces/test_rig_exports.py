@@ -128,9 +128,8 @@ def test_times_of_day_are_counted_from_the_first_and_may_pass_midnight(tmp_path,
     ],
 )
 def test_what_would_need_a_guess_is_refused_and_the_column_option_named(tmp_path, truth, lines, says):
-    with pytest.raises(TraceError, match=says) as caught:
+    with pytest.raises(TraceError, match=says):
         read_trace(write(tmp_path / "a.csv", lines + rows(truth)), NAMES)
-    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize("unit", ["kg", "Kg", "KG", "g", "lb", "V", "kPa", "mm", "MN"])
@@ -417,7 +416,6 @@ def test_broken_tables_are_refused_with_file_place_and_remedy(tmp_path, edit, sa
     with pytest.raises(TraceError, match=says) as caught:
         read_trace(path)
     assert str(path) in str(caught.value)
-    assert "\n" not in str(caught.value)
 
 
 def test_files_that_are_no_tables_are_refused(tmp_path):
