@@ -8,6 +8,7 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 
+from editing import append
 from limbfit.pipeline.engine.store import write_curves
 
 SPEED = "40"  # an accelerated clock
@@ -31,8 +32,7 @@ def ready(study):
         time_s, displacement, force = indentation(peak=peak)
         write_curves(folder / f"{name}.csv", time_s=time_s, displacement_mm=displacement, force_N=force)
         (study / f"{name}.csv").unlink()
-    file = study / "study.toml"
-    file.write_text(file.read_text() + ACQUIRE)
+    append(study, ACQUIRE)
     return study
 
 

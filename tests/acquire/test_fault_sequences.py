@@ -111,11 +111,12 @@ class Sequences(RuleBasedStateMachine):
             self.bench.check_end()
 
 
-def run(examples: int) -> None:
+@pytest.mark.slow
+def test_two_thousand_sequences() -> None:
     run_state_machine_as_test(
         Sequences,
         settings=settings(
-            max_examples=examples,
+            max_examples=2000,
             stateful_step_count=8,
             deadline=None,
             derandomize=True,
@@ -123,13 +124,3 @@ def run(examples: int) -> None:
             suppress_health_check=list(HealthCheck),
         ),
     )
-
-
-@pytest.mark.slow
-def test_sixteen_sequences() -> None:
-    run(16)
-
-
-@pytest.mark.slow
-def test_two_thousand_sequences() -> None:
-    run(2000)

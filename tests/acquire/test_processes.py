@@ -24,6 +24,7 @@ from in_process import settings
 
 import limbfit
 from acquiring import SPEED, fitsocket, start
+from editing import append, edit
 from limbfit.acquire import LineDevice, LiveUpdate, Session, connect, read_recording, run_session
 from limbfit.acquire.line_protocol import Encoder, Flags, Sample, SetLimits
 from limbfit.acquire.protocol import Abort, Phase, Signal
@@ -50,9 +51,8 @@ def acquire(study, address: str, *words: object) -> tuple[int, dict, str]:
 
 @pytest.mark.slow
 def test_both_sites_are_acquired_into_the_study(ready) -> None:
-    file = ready / "study.toml"
     # The device runs for longer than an operator may take: each session has a time of its own.
-    file.write_text(file.read_text() + "operator_limit_s = 10.0\n")
+    append(ready, "operator_limit_s = 10.0\n")
     with fitsocket(ready, "--speed", SPEED) as (address, _):
         code, found, err = acquire(ready, address, "--unattended", "--depth", 4.0)
         assert code == 0, err
@@ -373,8 +373,7 @@ def test_a_hostile_device_gets_one_clean_line(ready, limbfit, answer: bytes) -> 
 
 
 def test_nothing_is_written_outside_the_study(ready, limbfit) -> None:
-    file = ready / "study.toml"
-    file.write_text(file.read_text().replace('trace = "1.csv"', 'trace = "../1.csv"'))
+    edit(ready, "1.csv", "../1.csv")
     words = ("--device", "tcp://127.0.0.1:1", "--unattended", "--site", "1", "--depth", 3.0)
     code, _, err = limbfit("acquire", ready, *words)
     assert code == 2

@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from in_process import Bench
 
+from editing import append, edit
 from limbfit import check_recording, load_study
 from limbfit.acquire import Recorder, check_record, find_ramps, follow_recording, read_recording
 from limbfit.acquire.line_protocol import PINS, Sample
@@ -50,15 +51,18 @@ def test_what_was_written_is_read(written) -> None:
 
 def test_a_ramp_is_written_in_the_units_that_the_names_of_the_columns_state(study) -> None:
     """Whatever writes the study's other records, ``limbfit acquire`` measures in s, mm and N."""
-    made = read_trace(study / "1.csv")
-    names = ("Time (ms)", "Depth (cm)", "Load (kN)")
-    file = study / "study.toml"
-    stated = "\n".join(f'{key} = "{name}"' for key, name in zip(TRACE_COLUMNS, names))
-    file.write_text(f"{file.read_text()}\n[traces]\n{stated}\n")
-    write_ramp(load_study(study), study / "ramp.csv", RecordedRamp(1, made))
-    read: Trace = read_trace(study / "ramp.csv", names)
+    made, read = write_under(study, ("Time (ms)", "Depth (cm)", "Load (kN)"))
     for key in TRACE_COLUMNS:
         np.testing.assert_allclose(getattr(read, key), getattr(made, key), rtol=1e-4, atol=1e-4)
+
+
+def write_under(study, names) -> tuple[Trace, Trace]:
+    """A ramp, and what is read of it once it is written under names of columns."""
+    made = read_trace(study / "1.csv")
+    stated = "\n".join(f'{key} = "{name}"' for key, name in zip(TRACE_COLUMNS, names))
+    append(study, f"[traces]\n{stated}\n")
+    write_ramp(load_study(study), study / "ramp.csv", RecordedRamp(1, made))
+    return made, read_trace(study / "ramp.csv", names)
 
 
 def test_any_table_reader_reads_the_rows(written) -> None:
@@ -219,25 +223,20 @@ def test_ramps_that_do_not_repeat_are_named(tmp_path) -> None:
     assert checks(recording)["repeatability"] is False
 
 
-@pytest.mark.parametrize("trace", ["../elsewhere.csv", "/elsewhere/1.csv"])
-def test_no_record_is_made_outside_the_studys_folder(study, trace):
-    file = study / "study.toml"
-    file.write_text(file.read_text().replace("1.csv", trace))
-    with pytest.raises(InputError, match=rf"{trace} lies outside the study's folder; nothing is recorded"):
-        check_recording(load_study(file, recorded=False), "1", depth_mm=5.0)
-
-
-def test_a_record_that_would_be_text_under_the_name_of_another_format_is_refused_before_it_is_made(study):
-    file = study / "study.toml"
-    file.write_text(file.read_text().replace("1.csv", "1.xlsx"))
-    with pytest.raises(InputError, match=r"written as text, which 1\.xlsx is not; name a file \.csv"):
-        check_recording(load_study(file, recorded=False), "1", depth_mm=5.0)
+@pytest.mark.parametrize(
+    ("trace", "what"),
+    [
+        ("../elsewhere.csv", "../elsewhere.csv lies outside the study's folder; nothing is recorded"),
+        ("/elsewhere/1.csv", "/elsewhere/1.csv lies outside the study's folder; nothing is recorded"),
+        ("1.xlsx", r"written as text, which 1\.xlsx is not; name a file \.csv"),
+    ],
+)
+def test_a_record_that_cannot_be_kept_is_refused_before_it_is_made(study, trace, what):
+    edit(study, "1.csv", trace)
+    with pytest.raises(InputError, match=what):
+        check_recording(load_study(study, recorded=False), "1", depth_mm=5.0)
 
 
 def test_a_ramp_under_names_with_commas_is_read_back(study):
-    made, names = read_trace(study / "1.csv"), ("Time, s", "Way, mm", "Load, N")
-    file = study / "study.toml"
-    stated = "\n".join(f'{key} = "{name}"' for key, name in zip(TRACE_COLUMNS, names))
-    file.write_text(f"{file.read_text()}\n[traces]\n{stated}\n")
-    write_ramp(load_study(file, recorded=False), study / "ramp.csv", RecordedRamp(1, made))
-    assert read_trace(study / "ramp.csv", names).force_N == pytest.approx(made.force_N)
+    made, read = write_under(study, ("Time, s", "Way, mm", "Load, N"))
+    assert read.force_N == pytest.approx(made.force_N)

@@ -16,6 +16,8 @@ import numpy as np
 import pytest
 from lab_rig import compute_force
 
+from acquiring import start as start_command
+from editing import append
 from limbfit import InputError, acquire_site, check_rig, judge_recording, load_study
 from limbfit.acquire.rig import LOOKAHEAD_S, find_check, read_rig, store_check
 from limbfit.errors import RunError
@@ -78,8 +80,7 @@ def check(file: Path) -> None:
 def planned(study: Path) -> Path:
     """A study whose site 1 is yet to be recorded."""
     (study / "1.csv").unlink()
-    file = study / "study.toml"
-    file.write_text(file.read_text() + ACQUIRE)
+    append(study, ACQUIRE)
     return study
 
 
@@ -232,18 +233,8 @@ def test_a_check_holds_for_a_day_and_for_the_rig_that_was_checked(start: Start) 
 def test_a_host_that_is_killed_leaves_a_stage_that_stops_by_itself(planned: Path, start: Start) -> None:
     file = start()
     store_check(file, 1.0)
-    words = [
-        "acquire",
-        str(planned),
-        "--site",
-        "1",
-        "--device",
-        f"rig:{file}",
-        "--unattended",
-        "--depth",
-        "4",
-    ]
-    process = subprocess.Popen([sys.executable, "-m", "limbfit", *words], stderr=subprocess.PIPE, text=True)
+    session = ("--site", "1", "--device", f"rig:{file}", "--unattended", "--depth", "4")
+    process = start_command("acquire", planned, *session)
     assert process.stderr is not None
     for line in process.stderr:
         if ": search" in line:

@@ -10,7 +10,7 @@ import pytest
 import pyvista as pv
 import typer
 
-from editing import append, edit
+from editing import append, edit, rewrite
 from limbfit import __version__
 from limbfit.cli import GROUPS, app
 from limbfit.cli.commands import show_findings, show_summary
@@ -218,27 +218,14 @@ def open_skin(study):
     surface.extract_cells(range(20, surface.n_cells)).extract_surface(algorithm=None).save(study / "skin.stl")
 
 
-def rewrite(study, change) -> None:
-    table = np.loadtxt(study / "1.csv", delimiter=",", skiprows=1)
-    change(table)
-    header = "time_s,displacement_mm,force_N"
-    np.savetxt(study / "1.csv", table, delimiter=",", header=header, comments="")
+def scale(study, at, factor) -> None:
+    """Multiply a part of the first record's table."""
 
+    def change(table):
+        table[at] *= factor
+        return table
 
-def spoil_nan(table):
-    table[100, 2] = np.nan
-
-
-def spoil_time(table):
-    table[100, 0] = table[90, 0]
-
-
-def spoil_contact(table):
-    table[:, 2] = 0.0
-
-
-def spoil_unit(table):
-    table[:, 1] /= 1000.0
+    rewrite(study / "1.csv", change)
 
 
 SPOILT = {
@@ -262,10 +249,10 @@ SPOILT = {
         lambda s: edit(s, "position = [40.0, 0.0, 60.0]", "position = [46.5, 0.0, 60.0]"),
         ("study.toml", "sites.1", "off the skin"),
     ),
-    "no number": (lambda s: rewrite(s, spoil_nan), ("1.csv", "force_N")),
-    "time that goes back": (lambda s: rewrite(s, spoil_time), ("1.csv", "time")),
-    "no contact": (lambda s: rewrite(s, spoil_contact), ("1.csv", "contact")),
-    "metres": (lambda s: rewrite(s, spoil_unit), ("1.csv", "mm")),
+    "no number": (lambda s: scale(s, np.s_[100, 2], np.nan), ("1.csv", "force_N")),
+    "time that goes back": (lambda s: scale(s, np.s_[100, 0], 0.9), ("1.csv", "time")),
+    "no contact": (lambda s: scale(s, np.s_[:, 2], 0.0), ("1.csv", "contact")),
+    "metres": (lambda s: scale(s, np.s_[:, 1], 1e-3), ("1.csv", "mm")),
 }
 
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from conftest import write_trace
+from editing import append, edit, rewrite
 from limbfit import check_study, load_study
 from limbfit.errors import InputError, StudyError, TraceError
 from limbfit.traces import Trace, check_trace, find_touch_down, interpret_record
@@ -183,19 +184,12 @@ def test_contact_is_seen_in_noise():
 def study(pristine, tmp_path):
     """The stump, and a smoothing that need not be chosen anew for each record."""
     folder = shutil.copytree(pristine, tmp_path / "study")
-    file = folder / "study.toml"
-    file.write_text(file.read_text() + "[traces]\nsmoothing = 0.1\n")
+    append(folder, "[traces]\nsmoothing = 0.1\n")
     return folder
 
 
 def checked(study):
     return check_study(load_study(study), listener=lambda event: None)
-
-
-def change(study, name, edit):
-    file = study / f"{name}.csv"
-    table = np.loadtxt(file, delimiter=",", skiprows=1)
-    np.savetxt(file, edit(table), delimiter=",", header="time_s,displacement_mm,force_N", comments="")
 
 
 def test_check_tells_what_was_mended_and_what_is_wrong_and_not_mended(study):
@@ -208,8 +202,8 @@ def test_check_tells_what_was_mended_and_what_is_wrong_and_not_mended(study):
         table[:, 2] = np.minimum(table[:, 2], 0.7 * table[:, 2].max())
         return table[(table[:, 0] < 2.0) | (table[:, 0] > 2.6)]
 
-    change(study, "1", drift)
-    change(study, "2", cut_off)
+    rewrite(study / "1.csv", drift)
+    rewrite(study / "2.csv", cut_off)
     found = checked(study)
     told = {(*flag["sites"], flag["kind"]): flag["text"] for flag in found["flags"]}
     assert list(told)[:2] == [("1", "spikes"), ("1", "drift")]
@@ -220,26 +214,20 @@ def test_check_tells_what_was_mended_and_what_is_wrong_and_not_mended(study):
 
 
 def test_check_names_the_file_of_a_record_that_begins_in_contact(study):
-    change(study, "1", lambda table: table[200:800])
+    rewrite(study / "1.csv", lambda table: table[200:800])
     with pytest.raises(InputError, match=r"1\.csv.*force_N: the record begins in contact"):
         checked(study)
 
 
 def test_check_says_that_a_record_has_loading_only(study):
-    change(study, "1", lambda table: table[: int(table[:, 1].argmax())])
+    rewrite(study / "1.csv", lambda table: table[: int(table[:, 1].argmax())])
     found = checked(study)
     assert any(fact.startswith("site 1:") and "loading only" in fact for fact in found["facts"])
     assert found["flags"] == []
 
 
-def same_place(study):
-    text = (study / "study.toml").read_text()
-    first, second = (line for line in text.splitlines() if line.startswith("position"))
-    (study / "study.toml").write_text(text.replace(second, first))
-
-
 def test_two_sites_at_one_place_with_different_records_are_told(study):
-    same_place(study)
+    edit(study, "position = [0.0, 40.0, 50.0]", "position = [40.0, 0.0, 60.0]")
     sound = checked(study)  # repeats of one record
     assert sound["flags"] == []
     assert not any("loading only" in fact for fact in sound["facts"])
@@ -253,14 +241,9 @@ def test_two_sites_at_one_place_with_different_records_are_told(study):
 # --- settings that cannot be meant
 
 
-def settings(study, table):
-    text = (study / "study.toml").read_text()
-    (study / "study.toml").write_text(text.replace("[[sites]]", table + "\n[[sites]]", 1))
-
-
 @pytest.mark.parametrize("ratio", ["1e9", "0.5"])
 def test_a_bulk_modulus_that_no_tissue_has_is_refused(study, ratio):
-    settings(study, f"[material]\nkappa_ratio = {ratio}\n")
+    append(study, f"[material]\nkappa_ratio = {ratio}\n")
     with pytest.raises(
         StudyError, match=r"study\.toml: material\.kappa_ratio: give (10 or more|at most 10000)"
     ):
@@ -269,14 +252,13 @@ def test_a_bulk_modulus_that_no_tissue_has_is_refused(study, ratio):
 
 @pytest.mark.parametrize("table", ["mesh", "mesh.coarse"])
 def test_a_mesh_of_billions_of_cells_is_refused(study, table):
-    settings(study, f"[{table}]\nedge_near_mm = 0.01\n")
+    append(study, f"[{table}]\nedge_near_mm = 0.01\n")
     with pytest.raises(
         StudyError, match=r"study\.toml: mesh.*billion cells.* give edge_near_mm of 0\.\d+ or more"
     ) as caught:
         load_study(study)
     least = float(str(caught.value).split("edge_near_mm of ")[1].split()[0])
-    text = (study / "study.toml").read_text()
-    (study / "study.toml").write_text(text.replace("0.01", str(least)))
+    edit(study, "0.01", str(least))
     load_study(study)
 
 

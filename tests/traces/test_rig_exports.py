@@ -11,7 +11,7 @@ from nptdms import ChannelObject, TdmsWriter
 from scipy.io import savemat
 
 from limbfit.errors import TraceError
-from limbfit.traces import Trace, check_trace, read_layers, read_trace
+from limbfit.traces import COLUMNS, Trace, check_trace, read_layers, read_trace
 
 NAMES = ("Time", "Extension", "Load")
 
@@ -340,54 +340,24 @@ def test_a_missing_library_is_named_with_its_extra(tmp_path, monkeypatch, module
         read_trace(path, NAMES)
 
 
-def write_record(path, trace, header="time_s,displacement_mm,force_N", delimiter=",", decimal="."):
-    rows = zip(trace.time_s, trace.displacement_mm, trace.force_N)
-    lines = [delimiter.join(f"{v:.5f}".replace(".", decimal) for v in row) for row in rows]
-    path.write_text("\n".join([header.replace(",", delimiter), *lines]) + "\n", encoding="utf-8")
-    return path
-
-
 @pytest.mark.parametrize(("delimiter", "decimal"), [(",", "."), (";", "."), ("\t", "."), (";", ",")])
-def test_tables_of_all_flavours_read_the_same(tmp_path, delimiter, decimal):
-    trace, _ = record(rate=50)
-    read = read_trace(write_record(tmp_path / "a.csv", trace, delimiter=delimiter, decimal=decimal))
-    assert read.force_N == pytest.approx(trace.force_N, abs=1e-5)
-    assert read.displacement_mm == pytest.approx(trace.displacement_mm, abs=1e-5)
+def test_tables_of_all_flavours_read_the_same(tmp_path, truth, delimiter, decimal):
+    lines = [delimiter.join(COLUMNS), *rows(truth, delimiter, decimal=decimal)]
+    assert_read(write(tmp_path / "a.csv", lines), truth, (), COLUMNS)
 
 
-def test_columns_are_found_by_name_whatever_their_order_and_company(tmp_path):
-    trace, _ = record(rate=50)
-    path = tmp_path / "a.csv"
-    rows = [
-        f"{t:.4f},x,{f:.4f},{d:.4f}" for t, d, f in zip(trace.time_s, trace.displacement_mm, trace.force_N)
-    ]
-    path.write_text("\n".join(["# recorded on a Monday", '"t","note","F","u"', *rows]), encoding="utf-8-sig")
-    read = read_trace(path, columns=("t", "u", "F"))
-    assert read.displacement_mm == pytest.approx(trace.displacement_mm, abs=1e-4)
+def test_columns_are_found_by_name_whatever_their_order_and_company(tmp_path, truth):
+    cells = (f"{t:.6f},x,{f:.6f},{d:.6f}" for t, d, f in truth.T)
+    path = write(tmp_path / "a.csv", ["# recorded on a Monday", '"t","note","F","u"', *cells], "utf-8-sig")
+    assert_read(path, truth, (), ("t", "u", "F"))
 
 
 @pytest.mark.parametrize("struct", [False, True])
-def test_mat_files_hold_vectors_or_one_struct(tmp_path, struct):
-    trace, _ = record(rate=50)
-    content = {
-        "time_s": trace.time_s[:, None],
-        "displacement_mm": trace.displacement_mm[None],
-        "force_N": trace.force_N,
-    }
+def test_mat_files_hold_vectors_or_one_struct(tmp_path, truth, struct):
+    content = dict(zip(COLUMNS, (truth[0][:, None], truth[1][None], truth[2])))
     savemat(tmp_path / "a.mat", {"record": content} if struct else content)
     read = read_trace(tmp_path / "a.mat")
-    assert np.array_equal(read.force_N, trace.force_N)
-    assert np.array_equal(read.time_s, trace.time_s)
-
-
-def broken(tmp_path, edit):
-    """A file whose lines were edited."""
-    trace, _ = record(rate=50)
-    path = write_record(tmp_path / "a.csv", trace)
-    lines = path.read_text().splitlines()
-    edit(lines)
-    path.write_text("\n".join(lines))
-    return path
+    assert np.array_equal([read.time_s, read.displacement_mm, read.force_N], truth)
 
 
 def replace(line, text):
@@ -411,8 +381,10 @@ def replace(line, text):
         (lambda lines: lines.clear(), "the file is empty"),
     ],
 )
-def test_broken_tables_are_refused_with_file_place_and_remedy(tmp_path, edit, says):
-    path = broken(tmp_path, edit)
+def test_broken_tables_are_refused_with_file_place_and_remedy(tmp_path, truth, edit, says):
+    lines = [",".join(COLUMNS), *rows(truth, ",")]
+    edit(lines)
+    path = write(tmp_path / "a.csv", lines)
     with pytest.raises(TraceError, match=says) as caught:
         read_trace(path)
     assert str(path) in str(caught.value)
@@ -430,7 +402,7 @@ def test_files_that_are_no_tables_are_refused(tmp_path):
         read_trace(path)
 
 
-def test_broken_mat_files_are_refused(tmp_path):
+def test_broken_mat_files_are_refused(tmp_path, truth):
     path = tmp_path / "a.mat"
     path.write_bytes(b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(124) + b"\x00\x02IM" + bytes(500))
     with pytest.raises(TraceError, match=r"version 7\.3; save it in MATLAB with '-v7'"):
@@ -439,8 +411,7 @@ def test_broken_mat_files_are_refused(tmp_path):
         path.write_bytes(content)
         with pytest.raises(TraceError, match="not a readable MAT file"):
             read_trace(path)
-    trace, _ = record(rate=50)
-    columns = {"time_s": trace.time_s, "displacement_mm": trace.displacement_mm}
+    columns = dict(zip(COLUMNS, truth[:2]))
     savemat(path, columns | {"force_N": np.ones((4, 4))})
     with pytest.raises(TraceError, match="force_N: not a vector of real numbers"):
         read_trace(path)
@@ -450,7 +421,7 @@ def test_broken_mat_files_are_refused(tmp_path):
     savemat(path, columns)
     with pytest.raises(TraceError, match="no column 'force_N'"):
         read_trace(path)
-    savemat(path, columns | {"force_N": trace.force_N[:-1]})
+    savemat(path, columns | {"force_N": truth[2, :-1]})
     with pytest.raises(TraceError, match=r"force_N: .* values for .* times"):
         read_trace(path)
 
