@@ -30,6 +30,10 @@ TRUTH = {
     "fat": {"c_kPa": 2.0, "m": 4.0, "gamma": 1.0, "tau_s": 1.2},
     "muscle": {"c_kPa": 5.0, "m": 5.0, "gamma": 3.0, "tau_s": 0.3},
 }
+SKIN_OVER_MUSCLE = {
+    "skin": {"c_kPa": 9.0, "m": 6.0, "gamma": 2.0, "tau_s": 0.6},
+    "muscle": {"c_kPa": 4.5, "m": 4.5, "gamma": 3.0, "tau_s": 0.3},
+}
 
 BLOCK_STUDY = """
 [study]

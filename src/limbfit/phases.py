@@ -60,7 +60,7 @@ def choose_tolerance_mm(displacement: Array) -> float:
 
 
 def find_phases(
-    times: Array, displacement: Array, *, tolerance: float | None = None, contact_s: float | None = None
+    times: Array, displacement: Array, *, tolerance: float | None = None
 ) -> tuple[MotionPhase, ...]:
     """The phases of a displacement: corners of a broken line, or as many samples as one likes.
 
@@ -69,7 +69,7 @@ def find_phases(
     to a record first, in ``traces.displacement``).
 
     ``times``, ``displacement``: (n,) s, growing, and mm, with n > 1. ``tolerance``: mm that count as nothing;
-    ``choose_tolerance_mm`` by default. ``contact_s``: when the skin is met: all before is one ``approach``.
+    ``choose_tolerance_mm`` by default.
     """
     times, displacement = np.asarray(times, dtype=float), np.asarray(displacement, dtype=float)
     allowed = choose_tolerance_mm(displacement) if tolerance is None else tolerance
@@ -82,7 +82,7 @@ def find_phases(
         if found and piece.kind == found[-1].kind == "hold":
             piece = replace(found.pop(), end_s=piece.end_s, end_mm=piece.end_mm)
         found.append(piece)
-    return tuple(found) if contact_s is None else _from_contact(found, contact_s)
+    return tuple(found)
 
 
 def find_loading_end(phases: Sequence[MotionPhase]) -> MotionPhase | None:
@@ -144,15 +144,14 @@ def spread(phases: Sequence[MotionPhase], points: int, among: Array | None = Non
 
 
 def describe_phases(phases: Sequence[MotionPhase]) -> str:
-    """The phases as people say them, cycles that repeat within 5 % counted; the approach left out."""
-    named = [phase for phase in phases if phase.kind != "approach"]
-    for length in range(1, len(named) // 2 + 1):
-        cycles = len(named) // length
-        if cycles * length == len(named) and all(
-            _is_alike(a, b) for a, b in zip(named, named[length:], strict=False)
+    """The phases from touch-down on as people say them, cycles that repeat within 5 % counted."""
+    for length in range(1, len(phases) // 2 + 1):
+        cycles = len(phases) // length
+        if cycles * length == len(phases) and all(
+            _is_alike(a, b) for a, b in zip(phases, phases[length:], strict=False)
         ):
-            return f"{cycles} cycles of {', '.join(map(_describe_phase, named[:length]))}"
-    return ", ".join(map(_describe_phase, named))
+            return f"{cycles} cycles of {', '.join(map(_describe_phase, phases[:length]))}"
+    return ", ".join(map(_describe_phase, phases))
 
 
 def _is_alike(one: MotionPhase, other: MotionPhase) -> bool:
@@ -167,20 +166,6 @@ def _describe_phase(phase: MotionPhase) -> str:
     if phase.kind == "hold":
         return f"hold for {phase.duration_s:.3g} s"
     return f"{phase.kind} at {abs(phase.rate_mm_s):.3g} mm/s"
-
-
-def _from_contact(phases: Sequence[MotionPhase], contact_s: float) -> tuple[MotionPhase, ...]:
-    """One approach up to contact, then the phases."""
-    first = phases[0]
-    if contact_s <= first.start_s:
-        return tuple(phases)
-    within = next((p for p in phases if p.end_s > contact_s), phases[-1])
-    at = float(np.interp(contact_s, [within.start_s, within.end_s], [within.start_mm, within.end_mm]))
-    left = [replace(p, start_s=contact_s, start_mm=at) if p is within else p for p in phases]
-    return (
-        MotionPhase("approach", first.start_s, contact_s, first.start_mm, at),
-        *(p for p in left if p.end_s > contact_s),
-    )
 
 
 def _find_corners(times: Array, values: Array, allowed: float) -> list[int]:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.sparse import csr_array, triu
 
+from layered import SKIN_OVER_MUSCLE as TRUTH
 from layered import build_block_site, layered_block
 from limbfit.errors import ProblemError
 from limbfit.fe import System, compute_tangent_at_rest
@@ -21,11 +22,7 @@ from limbfit.indentation import (
 from limbfit.mesh import Mesh, cell_volumes, check
 from limbfit.study import SolverTable
 
-TISSUES = ("skin", "muscle")
-TRUTH = {
-    "skin": {"c_kPa": 9.0, "m": 6.0, "gamma": 2.0, "tau_s": 0.6},
-    "muscle": {"c_kPa": 4.5, "m": 4.5, "gamma": 3.0, "tau_s": 0.3},
-}
+TISSUES = tuple(TRUTH)
 RADIUS_MM = 42.0
 CENTRE, AXIS = np.zeros(3), np.array([0.0, 0.0, -1.0])
 

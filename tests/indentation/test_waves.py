@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from layered import SKIN_OVER_MUSCLE as TRUTH
 from layered import build_block_site
 from limbfit.bench.timing import build_layered_block
 from limbfit.errors import ProblemError
@@ -15,11 +16,7 @@ from limbfit.indentation.observing import DISC_HALF_MM, DISC_RADIUS_MM, compute_
 from limbfit.mesh import locate
 from limbfit.study import IndenterTable, SolverTable
 
-TISSUES = ("skin", "muscle")
-TRUTH = {
-    "skin": {"c_kPa": 9.0, "m": 6.0, "gamma": 2.0, "tau_s": 0.6},
-    "muscle": {"c_kPa": 4.5, "m": 4.5, "gamma": 3.0, "tau_s": 0.3},
-}
+TISSUES = tuple(TRUTH)
 C, M, GAMMA, TAU = 0.006, 5.0, 2.0, 0.8  # MPa, -, -, s
 SHORTER, RAMP_S = 0.25, 0.02
 MIDDLE = (0.0, 0.0, -16.0)

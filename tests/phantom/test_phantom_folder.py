@@ -126,6 +126,8 @@ def test_a_failure_leaves_nothing_behind(tmp_path) -> None:
     [
         ({"detail": "fine"}, InputError, "unknown detail 'fine'"),
         ({"sites": ["99"]}, SiteError, "no site '99'"),
+        ({"limb": "forearm"}, InputError, "unknown limb 'forearm'"),
+        ({"limb": "transfemoral", "tendon": True}, InputError, "no patellar tendon"),
     ],
 )
 def test_impossible_wishes_are_refused(tmp_path, keywords, error, message) -> None:

@@ -13,7 +13,7 @@ from limbfit import run_study
 from limbfit.anatomy.imaging import write_labels
 from limbfit.anatomy.segmentation.segmentation import segment
 from limbfit.anatomy.surfaces.surfaces import Anatomy, Surface
-from limbfit.errors import InputError, StudyError
+from limbfit.errors import StudyError
 from limbfit.phantom import Limb, build_true_sites, make_limb, make_phantom
 from limbfit.phantom.build import LINER_MM, Area, make_socket
 from limbfit.phantom.geometry import build_outer_surface, build_true_anatomy
@@ -84,19 +84,6 @@ def test_its_socket_presses_in_where_it_says(rectified) -> None:
     for area in areas:
         near = np.linalg.norm(socket.points - area.position, axis=1).argmin()
         assert depth[near] == pytest.approx(area.depth_mm + 1.8, abs=1.2)  # and 3 % of some 60 mm
-
-
-@pytest.mark.parametrize(
-    ("keywords", "message"),
-    [
-        ({"limb": "forearm"}, "unknown limb 'forearm'"),
-        ({"limb": THIGH, "tendon": True}, "no patellar tendon"),
-    ],
-)
-def test_a_limb_that_there_is_not_is_refused(tmp_path: Path, keywords, message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        make_phantom(tmp_path / "study", mapping=cubic_law, **keywords)
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_its_study_needs_no_tibia(tmp_path: Path, rectified) -> None:

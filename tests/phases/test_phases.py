@@ -10,8 +10,8 @@ from limbfit.fe.solution.control import StepControl, schedule_steps
 from limbfit.phases import describe_phases, find_boundaries, find_loading_end, find_phases
 
 
-def kinds(times, displacement, **settings):
-    return [phase.kind for phase in find_phases(np.array(times), np.array(displacement), **settings)]
+def kinds(times, displacement):
+    return [phase.kind for phase in find_phases(np.array(times), np.array(displacement))]
 
 
 CYCLES = ([0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0], [0.0, 10.0, 2.0, 10.0, 2.0, 10.0, 0.0])
@@ -67,15 +67,6 @@ def test_rates_are_signed_means():
     load, hold, unload = find_phases(np.array([0.0, 2.0, 4.0, 5.0]), np.array([0.0, 8.0, 8.0, 0.0]))
     assert (load.rate_mm_s, hold.rate_mm_s, unload.rate_mm_s) == (4.0, 0.0, -8.0)
     assert hold.duration_s == 2.0
-
-
-def test_all_before_contact_is_one_approach():
-    times, displacement = [0.0, 0.5, 2.5, 3.0, 5.0], [0.0, 0.0, 10.0, 10.0, 0.0]
-    approach, *rest = find_phases(np.array(times), np.array(displacement), contact_s=0.9)
-    assert (approach.kind, approach.end_s, approach.end_mm) == ("approach", 0.9, 2.0)
-    assert [phase.kind for phase in rest] == ["load", "hold", "unload"]
-    assert (rest[0].start_s, rest[0].start_mm) == (0.9, 2.0)
-    assert kinds(times, displacement, contact_s=0.0) == ["hold", "load", "hold", "unload"]
 
 
 def test_phases_in_words():

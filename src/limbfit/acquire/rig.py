@@ -347,10 +347,10 @@ class Rig:
             self._withdraw()
 
 
-def measure_mean_force(rig: Rig, seconds: float = 1.0) -> float:
-    """The mean force in N over some time."""
+def measure_mean_force(rig: Rig) -> float:
+    """The mean force in N over a second."""
     values = []
-    end = time.monotonic() + seconds
+    end = time.monotonic() + 1.0
     while time.monotonic() < end:
         values.append(rig.measure_force())
     return sum(values) / len(values)
