@@ -136,7 +136,7 @@ class Robot:
             random, time.size
         )
         depth = np.interp(since, record.times_s, record.displacement_mm)
-        touch = TouchDown(BEFORE_S, 0.0, 0.0, 1.0, 0.0, False)
+        touch = TouchDown(BEFORE_S, 0.0, 0.0, 0.0, False)
         smooth = regularise(Trace(time, depth, raw), touch, smoothing)
         inside = since >= 0
         return smooth, raw[inside] - np.interp(since[inside], smooth.time_s, smooth.force_N)

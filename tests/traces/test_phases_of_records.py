@@ -99,7 +99,7 @@ def test_a_displacement_that_wanders_is_refused():
     time = np.arange(0, 40, 0.04)
     wander = np.abs(0.2 * np.cumsum(np.random.default_rng(1).standard_normal(time.size)))
     with pytest.raises(TraceError, match=r"displacement: the displacement wanders: 40 .* cut out the part"):
-        regularise(Trace(time, wander, wander), TouchDown(0.0, 0.0, 0.1, 1.0, 0.0, True))
+        regularise(Trace(time, wander, wander), TouchDown(0.0, 0.0, 0.1, 0.0, True))
 
 
 def test_a_record_that_is_only_held_or_drawn_back_is_refused():

@@ -30,7 +30,6 @@ _BINS = 200
 _MIN_APPROACH_MM = 0.1  # less of it before the skin is none
 EXPONENTS = np.linspace(1.0, 2.5, 13)  # flat punch full on: 1; sphere: 1.5; cone, or an edge coming in: 2
 STIFFENING = ((1.0, 2.5), (4.0, 2.5), (2.0, 2.0), (8.0, 2.0))  # a and q
-INITIAL_EXPONENTS = np.r_[EXPONENTS, np.ones(len(STIFFENING))]  # exponents at the very start
 TAU_S = (0.1, 0.3, 1.0, 3.0)
 GAMMA = (0.5, 1.5, 4.0)
 _PLACE_COUNT = 60  # of touch-down
@@ -44,15 +43,13 @@ class TouchDown:
     """Where the indenter met the skin.
 
     ``uncertainty_mm`` is a standard deviation: the spread that the noise allows, with an exponent and a
-    relaxation of the onset that are not known. ``exponent`` is p of its power law.
-    ``in_contact_at_start`` says that the record has no slack before the skin, so that the baseline rests on
-    the assumption of a zeroed sensor.
+    relaxation of the onset that are not known. ``in_contact_at_start`` says that the record has no slack
+    before the skin, so that the baseline rests on the assumption of a zeroed sensor.
     """
 
     time_s: float
     displacement_mm: float
     uncertainty_mm: float
-    exponent: float
     baseline_N: float
     in_contact_at_start: bool
 
@@ -79,7 +76,6 @@ def find_touch_down(trace: Trace, line: BrokenLine | None = None) -> TouchDown:
         time_s=float(np.interp(onset.place_mm, np.maximum.accumulate(travel), time)),
         displacement_mm=onset.place_mm,
         uncertainty_mm=onset.sd,
-        exponent=onset.exponent,
         baseline_N=onset.baseline_N,
         in_contact_at_start=bool(is_near and moving < MIN_SAMPLES),
     )
@@ -177,7 +173,6 @@ class Onset:
 
     place_mm: float
     sd: float
-    exponent: float
     baseline_N: float
 
 
@@ -231,8 +226,7 @@ def _weigh_onsets(part: OnsetPart, whiten: Array, places: Array, zeroed: bool) -
     along = share.sum(axis=(0, 2))
     mean, step = float(along @ places), places[1] - places[0]
     sd = float(np.sqrt(along @ (places - mean) ** 2 + step**2 / 12))
-    exponent = float(share.sum(axis=(0, 1)) @ INITIAL_EXPONENTS)
-    return Onset(mean, sd, exponent, float((share * baseline).sum()))
+    return Onset(mean, sd, float((share * baseline).sum()))
 
 
 def _build_shapes(part: OnsetPart, places: Array) -> Array:
