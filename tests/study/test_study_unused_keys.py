@@ -22,97 +22,73 @@ from test_study_docs import KEYS
 from limbfit.errors import StudyError
 from limbfit.study.loading import UNUSED_KEYS, UNUSED_RECORD_KEYS, UNUSED_SITE_KEYS
 
-# Studies that state a key in vain: what is set in which study, and the key that is refused.
 AMPUTATED = ("geometry.amputation", {"point": [0.0, 0.0, 0.0]})
-IN_VAIN: list[tuple[dict[str, Any], dict[str, Any], str]] = [
-    (GIVEN, {"segmentation.contrast": "T1"}, "segmentation"),
+Vain = tuple[dict[str, Any], dict[str, Any], str]
+
+
+def vain(content: dict[str, Any], changes: dict[str, Any], key: str = "") -> Vain:
+    """A study that states a key in vain: the last that is set in it, unless it is another one."""
+    parts = [part for part in list(changes)[-1].split(".") if not part.isdecimal()]
+    return content, changes, key or ".".join(parts)
+
+
+NO_BONES = {"skin": "skin.stl"}
+FAST = {"site": "1", "name": "fast", "trace": "1.csv"}
+IN_VAIN: list[Vain] = [
+    vain(GIVEN, {"segmentation.contrast": "T1"}, "segmentation"),
     *[
-        (
+        vain(
             IMAGED,
             {"segmentation.labels": "labels.nrrd", f"segmentation.{key}": ACTS[f"segmentation.{key}"][1]},
-            f"segmentation.{key}",
         )
         for key in ("contrast", "seeds", "bias_correction", "min_bone_volume_mm3")
     ],
-    (
+    vain(
         IMAGED,
         {"segmentation.seeds": {"tibia": [[0.0, 0.0, 0.0]]}, "segmentation.min_bone_volume_mm3": 500.0},
-        "segmentation.min_bone_volume_mm3",
     ),
-    (
-        IMAGED,
-        {"segmentation.contrast": "CT", "segmentation.bias_correction": True},
-        "segmentation.bias_correction",
-    ),
-    (IMAGED, {"image.path": "labels.nrrd", "image.series": "1.2"}, "image.series"),
-    (IMAGED, {"sites": GIVEN["sites"], "records": []}, "image.markers"),
-    (GIVEN, {"geometry.surface_edge_mm": 3.0}, "geometry.surface_edge_mm"),
-    (GIVEN, {"geometry.amputation_pad_mm": 15.0}, "geometry.amputation_pad_mm"),
-    (GIVEN, {"surfaces": {"skin": "skin.stl"}, "geometry.bone_policy": "trim-bone"}, "geometry.bone_policy"),
-    (
-        GIVEN,
-        {"surfaces": {"skin": "skin.stl"}, "geometry.bone_clearance_mm": 2.0},
-        "geometry.bone_clearance_mm",
-    ),
-    (GIVEN, {"mesh": {"edge_near_mm": 8, "edge_far_mm": 8, "growth": 0.5}}, "mesh.growth"),
-    (GIVEN, {"mesh": {"edge_near_mm": 8, "edge_far_mm": 8, "near_radius_mm": 9}}, "mesh.near_radius_mm"),
-    (GIVEN, {"mesh": {"edge_near_mm": 9, "edge_far_mm": 8}}, "mesh.edge_near_mm"),
-    (GIVEN, {"mesh.coarse": {"edge_near_mm": 8, "edge_far_mm": 8, "growth": 0.5}}, "mesh.coarse.growth"),
-    (
-        GIVEN,
-        {"mesh.coarse": {"edge_near_mm": 8, "edge_far_mm": 8, "near_radius_mm": 9}},
-        "mesh.coarse.near_radius_mm",
-    ),
-    (GIVEN, {"mesh.coarse": {"edge_near_mm": 9, "edge_far_mm": 8}}, "mesh.coarse.edge_near_mm"),
-    (
+    vain(IMAGED, {"segmentation.contrast": "CT", "segmentation.bias_correction": True}),
+    vain(IMAGED, {"image.path": "labels.nrrd", "image.series": "1.2"}),
+    vain(IMAGED, {"sites": GIVEN["sites"], "records": []}, "image.markers"),
+    vain(GIVEN, {"geometry.surface_edge_mm": 3.0}),
+    vain(GIVEN, {"geometry.amputation_pad_mm": 15.0}),
+    vain(GIVEN, {"surfaces": NO_BONES, "geometry.bone_policy": "trim-bone"}),
+    vain(GIVEN, {"surfaces": NO_BONES, "geometry.bone_clearance_mm": 2.0}),
+    *[
+        vain(GIVEN, {f"{mesh}.edge_far_mm": 8, f"{mesh}.edge_near_mm": near, f"{mesh}.{key}": value})
+        for mesh in ("mesh", "mesh.coarse")
+        for near, key, value in ((8, "growth", 0.5), (8, "near_radius_mm", 9), (9, "edge_near_mm", 9))
+    ],
+    vain(
         GIVEN,
         {
-            "mesh": {
-                **{"accuracy": "fast", "edge_near_mm": 4, "edge_far_mm": 20},
-                **{"near_radius_mm": 9, "growth": 0.5, "flatness": 1.0},
-            }
+            **{"mesh.edge_near_mm": 4, "mesh.edge_far_mm": 20, "mesh.near_radius_mm": 9},
+            **{"mesh.growth": 0.5, "mesh.flatness": 1.0, "mesh.accuracy": "fast"},
         },
-        "mesh.accuracy",
     ),
-    (GIVEN, {"indenter": {"shape": "sphere", "edge_radius_mm": 1.0}}, "indenter.edge_radius_mm"),
-    (GIVEN, {"sites": GIVEN["sites"][1:], "traces.time_s": "t"}, "traces"),
-    (
-        GIVEN,
-        {"calibration": {"stopping": "paper", "relative_tolerance": 0.01}},
-        "calibration.relative_tolerance",
-    ),
-    (
-        GIVEN,
-        {"calibration.force_error_percent": 2.0, "calibration.objective": "paper"},
-        "calibration.force_error_percent",
-    ),
-    (GIVEN, {"calibration.prior_tissues": {"skin": "none"}}, "calibration.prior_tissues"),
-    (GIVEN, {"calibration.seed": 3}, "calibration.seed"),
-    (GIVEN, {"calibration.use_socket_pressures": True}, "calibration.use_socket_pressures"),
-    (GIVEN, {"clamps.force_N": 9.0, "calibration.search_radius_mm": 50.0}, "calibration.search_radius_mm"),
+    vain(GIVEN, {"indenter.shape": "sphere", "indenter.edge_radius_mm": 1.0}),
+    vain(GIVEN, {"sites": GIVEN["sites"][1:], "traces.time_s": "t"}, "traces"),
+    vain(GIVEN, {"calibration.stopping": "paper", "calibration.relative_tolerance": 0.01}),
+    vain(GIVEN, {"calibration.objective": "paper", "calibration.force_error_percent": 2.0}),
+    vain(GIVEN, {"calibration.prior_tissues": {"skin": "none"}}),
+    vain(GIVEN, {"calibration.seed": 3}),
+    vain(GIVEN, {"calibration.use_socket_pressures": True}),
+    vain(GIVEN, {"clamps.force_N": 9.0, "calibration.search_radius_mm": 50.0}),
     *[
-        (
-            GIVEN,
-            {"mesh.edge_near_mm": 4.0, "calibration": {"search_radius_mm": 0, key: 2}},
-            f"calibration.{key}",
-        )
+        vain(GIVEN, {"mesh.edge_near_mm": 4.0, "calibration.search_radius_mm": 0, f"calibration.{key}": 2})
         for key in ("corrections", "correction_tolerance_percent")
     ],
     *[
-        (GIVEN, {"uncertainty": {"sources": False, key: 1.0}}, f"uncertainty.{key}")
+        vain(GIVEN, {"uncertainty.sources": False, f"uncertainty.{key}": 1.0})
         for key in ("layer_mm", "position_mm", "axis_degrees", "edge_radius_mm")
     ],
-    (
-        GIVEN,
-        {"indenter.shape": "cylinder", "uncertainty.edge_radius_mm": 1.0},
-        "uncertainty.edge_radius_mm",
-    ),
+    vain(GIVEN, {"indenter.shape": "cylinder", "uncertainty.edge_radius_mm": 1.0}),
     *[
-        (GIVEN, {"execution": {"workers": 1, key: 9.0}}, f"execution.{key}")
+        vain(GIVEN, {"execution.workers": 1, f"execution.{key}": 9.0})
         for key in ("time_limit_s", "memory_limit_GB")
     ],
     *[
-        (GIVEN, {"socket": {"file": "other.stl", key: value}}, f"socket.{key}")
+        vain(GIVEN, {"socket.file": "other.stl", f"socket.{key}": value})
         for key, value in {
             **{"reduction_percent": 2.0, "trim_mm": 5.0, "flare_mm": 0.0, "distal": "bearing"},
             **{"areas": [{"name": "1", "region": "tibial crest", "radius_mm": 9.0, "depth_mm": 2.0}]},
@@ -120,80 +96,57 @@ IN_VAIN: list[tuple[dict[str, Any], dict[str, Any], str]] = [
             **{"distal_clearance_mm": 2.0, "face_edge_mm": 5.0},
         }.items()
     ],
-    (GIVEN, {"socket.unit": "m"}, "socket.unit"),
-    (GIVEN, {"socket.space": "RAS"}, "socket.space"),
-    (GIVEN, {"socket": {"distal": "bearing", "distal_clearance_mm": 2.0}}, "socket.distal_clearance_mm"),
-    (GIVEN, {"socket.travel_mm": 20.0}, "socket.travel_mm"),
+    vain(GIVEN, {"socket.unit": "m"}),
+    vain(GIVEN, {"socket.space": "RAS"}),
+    vain(GIVEN, {"socket.distal": "bearing", "socket.distal_clearance_mm": 2.0}),
+    vain(GIVEN, {"socket.travel_mm": 20.0}),
     *[
-        (GIVEN, {"socket": {"liner": {"thickness_mm": 0, key: value}}}, f"socket.liner.{key}")
+        vain(GIVEN, {"socket.liner.thickness_mm": 0, f"socket.liner.{key}": value})
         for key, value in {"material": "gel", "c_kPa": 9.0, "m": 2.0, "gamma": 1.0, "tau_s": 1.0}.items()
     ],
-    (
+    vain(GIVEN, {"socket.loads": [{"name": "1", "force_N": [0, 0, 9]}], "socket.body_weight_N": 700.0}),
+    vain(
         GIVEN,
-        {"socket": {"loads": [{"name": "1", "force_N": [0, 0, 9]}], "body_weight_N": 700.0}},
-        "socket.body_weight_N",
+        {"sites.0.indenter": "ball", "indenters.ball.shape": "sphere", "indenters.ball.edge_radius_mm": 1.0},
     ),
-    (
+    vain(
         GIVEN,
         {
-            "indenters.ball": {"shape": "sphere", "edge_radius_mm": 1.0},
-            "sites.0.indenter": "ball",
-        },
-        "indenters.ball.edge_radius_mm",
-    ),
-    (
-        GIVEN,
-        {
-            "indenters.ball.width_mm": 10.0,
-            "sites.0.indenter": "ball",
-            "sites.1.indenter": "ball",
+            **{"indenters.ball.width_mm": 10.0, "sites.0.indenter": "ball", "sites.1.indenter": "ball"},
             "indenter.width_mm": 9.0,
         },
         "indenter",
     ),
-    (
+    vain(
         GIVEN,
         {
             "indenters.ball.width_mm": 10.0,
             "sites.0": {"name": "1", "position": [0.0, -50.0, 10.0], "indenter": "ball"},
-            "records": [{"site": "1", "name": "fast", "trace": "1.csv", "indenter": "ball"}],
+            "records": [{**FAST, "indenter": "ball"}],
         },
         "sites.indenter",
     ),
-    (GIVEN, {"material.fibres": {"muscle": "axis"}}, "material.fibres"),
-    (GIVEN, {"material.relaxation_span_s": [0.1, 1e3]}, "material.relaxation_span_s"),
-    (GIVEN, {"material.activation": {"time_s": [0.0, 1.0], "share": [1.0, 0.5]}}, "material.activation"),
-    (GIVEN, {"sites.1.control": "force"}, "sites.control"),
-    (GIVEN, {"sites.0.ultrasound_sd_mm": 0.2}, "sites.ultrasound_sd_mm"),
-    (GIVEN, {"sites.0.surface_sd_mm": 0.2}, "sites.surface_sd_mm"),
-    (GIVEN, {"sites.0.surface_frame": "site"}, "sites.surface_frame"),
-    (GIVEN, {"sites.0.shear_waves_sd_m_s": 0.2}, "sites.shear_waves_sd_m_s"),
-    (GIVEN, {"sites.0.shear_waves_bias_m_s": 0.2}, "sites.shear_waves_bias_m_s"),
+    vain(GIVEN, {"material.fibres": {"muscle": "axis"}}),
+    vain(GIVEN, {"material.relaxation_span_s": [0.1, 1e3]}),
+    vain(GIVEN, {"material.activation": {"time_s": [0.0, 1.0], "share": [1.0, 0.5]}}),
+    vain(GIVEN, {"sites.1.control": "force"}),
     *[
-        (
-            GIVEN,
-            {"records": [{"site": "1", "name": "fast", "trace": "1.csv", key: value}]},
-            f"records.1-fast.{key}",
-        )
+        one
         for key, value in {
             **{"ultrasound_sd_mm": 0.2, "surface_sd_mm": 0.2, "surface_frame": "site"},
             **{"shear_waves_sd_m_s": 0.2, "shear_waves_bias_m_s": 0.2},
         }.items()
+        for one in (
+            vain(GIVEN, {f"sites.0.{key}": value}),
+            vain(GIVEN, {"records": [{**FAST, key: value}]}, f"records.1-fast.{key}"),
+        )
     ],
-    (IMAGED, {"image.markers": "labels.nrrd", "image.markers_series": "1.2"}, "image.markers_series"),
-    (
-        GIVEN,
-        {"socket.design": {"adapter_diameter_mm": 0, "adapter_mm": 9.0}},
-        "socket.design.adapter_mm",
-    ),
-    (
-        IMAGED,
-        {"calibration.fixed": ["skin.c_kPa"]},
-        "calibration.prior.skin.c_kPa",
-    ),
-    (GIVEN, {"sites.1.weight": 2.0}, "sites.weight"),
-    (GIVEN, {"sites.0.speed_mm_s": 2.0}, "sites.speed_mm_s"),
-    (GIVEN, {"indenter.shape": "cylinder", "sites.0.edge": [0.0, 0.0, 1.0]}, "sites.edge"),
+    vain(IMAGED, {"image.markers": "labels.nrrd", "image.markers_series": "1.2"}),
+    vain(GIVEN, {"socket.design.adapter_diameter_mm": 0, "socket.design.adapter_mm": 9.0}),
+    vain(IMAGED, {"calibration.fixed": ["skin.c_kPa"]}, "calibration.prior.skin.c_kPa"),
+    vain(GIVEN, {"sites.1.weight": 2.0}),
+    vain(GIVEN, {"sites.0.speed_mm_s": 2.0}),
+    vain(GIVEN, {"indenter.shape": "cylinder", "sites.0.edge": [0.0, 0.0, 1.0]}),
 ]
 
 
