@@ -13,6 +13,7 @@ import pyvista as pv
 
 from acquiring import ready
 from browsing import launch, open_page, playwright, serve
+from editing import write_record
 from limbfit.cli import main
 from limbfit.errors import InputError
 from limbfit.fe.solution.compiling import are_compiled
@@ -103,15 +104,14 @@ def stump(radius: float, length: float, top: float) -> pv.PolyData:
     return half.triangulate().clean().compute_normals(auto_orient_normals=True, consistent_normals=True)
 
 
-def write_trace(path, *, depth=5.0, peak=6.0, touch=0.4, rate=100.0, header="time_s,displacement_mm,force_N"):
-    random = np.random.default_rng(1)
+def write_trace(path, *, depth=5.0, peak=6.0, rate=100.0):
+    random, touch = np.random.default_rng(1), 0.4
     speed, span = 0.96, (depth + touch) / 0.96
     time = np.arange(0.0, 2 * span, 1 / rate)
     displacement = speed * (span - np.abs(time - span))
     force = peak * np.clip((displacement - touch) / depth, 0, None) ** 1.3
     force += random.normal(0, 0.03, time.size)
-    np.savetxt(path, np.column_stack([time, displacement, force]), delimiter=",", header=header, comments="")
-    return np.column_stack([time, displacement, force])
+    write_record(path, np.column_stack([time, displacement, force]))
 
 
 @pytest.fixture(scope="module")

@@ -31,11 +31,13 @@ def append(study: Path, text: str) -> None:
         stream.write(text)
 
 
+def write_record(file: Path, table: Array) -> None:
+    """A record of times, displacements and forces in columns."""
+    np.savetxt(file, table, delimiter=",", header="time_s,displacement_mm,force_N", comments="")
+
+
 def rewrite(record: Path, change: Callable[[Array], Array]) -> None:
-    """Change the table of a record: times, displacements and forces in columns."""
-    table = np.loadtxt(record, delimiter=",", skiprows=1)
-    header = "time_s,displacement_mm,force_N"
-    np.savetxt(record, change(table), delimiter=",", header=header, comments="")
+    write_record(record, change(np.loadtxt(record, delimiter=",", skiprows=1)))
 
 
 def list_stale(before: Study, after: Study) -> set[str]:

@@ -15,9 +15,8 @@ def build_image(
     markers: Sequence[SkinMarker] = (),
     *,
     seed: int = 0,
-    noise: float | None = None,
     levels: Contrast = UTE,
 ) -> Volume:
     """The whole image; ``levels`` is one of ``CONTRASTS``."""
-    array = np.concatenate([signal for _, signal in generate_slabs(limb, grid, markers, seed, noise, levels)])
+    array = np.concatenate([signal for _, signal in generate_slabs(limb, grid, markers, seed, levels=levels)])
     return Volume(array, np.array(grid.spacing), grid.origin, grid.direction)

@@ -24,13 +24,13 @@ from relaxation import (
 MODULI_N = np.array([0.1, 0.05, 0.05])
 
 
-def made(amplitudes: np.ndarray, times_s: np.ndarray, noise_N: float = 5e-4) -> Curve:
+def made(amplitudes: np.ndarray, times_s: np.ndarray) -> Curve:
     """A ramp of 3 s and a hold of 10 s at 10 Hz with a known relaxation."""
     time = np.arange(0.0, 13.05, 0.1)
     depth = np.minimum(time * 1.5, 4.5)
     curve = Curve("made", time, depth, np.zeros_like(time), 30)
     force = relaxed_forces(curve, amplitudes, times_s) @ MODULI_N
-    return Curve("made", time, depth, force + np.random.default_rng(0).normal(0.0, noise_N, len(time)), 30)
+    return Curve("made", time, depth, force + np.random.default_rng(0).normal(0.0, 5e-4, len(time)), 30)
 
 
 def test_a_ramp_relaxes_as_its_closed_form() -> None:

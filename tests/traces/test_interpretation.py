@@ -68,8 +68,8 @@ def test_a_sensor_that_drifts_away_is_refused():
 # --- spikes
 
 
-def spiked(values, size, seed=3, per_mille=1.0):
-    random, n = np.random.default_rng(seed), len(values)
+def spiked(values, size, per_mille=1.0):
+    random, n = np.random.default_rng(3), len(values)
     places = random.choice(n, round(n * per_mille / 1000), replace=False)
     spikes = values.copy()
     spikes[places] += size * random.choice([-1, 1], len(places))
@@ -158,9 +158,9 @@ def test_a_sensor_with_an_offset_is_no_contact():
     assert found.touch_down.baseline_N == pytest.approx(0.6, abs=0.02)
 
 
-def fast(seed, clear=0.4):
+def fast(seed):
     """A weak record at 4.8 mm/s: a twentieth of its peak is but 1.5 times the noise."""
-    trace, _ = record(seed, clear=clear, depth=3.0, speed=4.8, peak=1.5, after=0.4)
+    trace, _ = record(seed, clear=0.4, depth=3.0, speed=4.8, peak=1.5, after=0.4)
     noise = 0.04 * np.random.default_rng([seed, 1]).standard_normal(trace.time_s.size)
     return replace(trace, force_N=trace.force_N + noise)
 

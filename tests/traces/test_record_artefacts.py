@@ -7,8 +7,9 @@ import pytest
 from made_records import path_record, record, relaxing
 from scipy.signal import lfilter
 
+from editing import write_record
 from limbfit.errors import TraceError
-from limbfit.traces import Trace, check_trace, interpret_record, read_trace
+from limbfit.traces import COLUMNS, Trace, check_trace, interpret_record, read_trace
 
 SLACK_MM, SPEED, NOISE_N = 0.4, 0.96, 0.03
 TURN_S = 5.4 / SPEED
@@ -22,8 +23,8 @@ def sound():
     return trace, clean(trace.time_s)
 
 
-def noisy(force, seed=1):
-    return force + NOISE_N * np.random.default_rng(seed).standard_normal(len(force))
+def noisy(force):
+    return force + NOISE_N * np.random.default_rng(1).standard_normal(len(force))
 
 
 def only(found, kind):
@@ -201,10 +202,8 @@ def test_a_displacement_in_coarse_steps_is_read(size, noise_mm):
 def test_rounded_times_are_spread(sound, tmp_path):
     trace, _ = sound
     rounded = replace(trace, time_s=np.round(trace.time_s, 2))
-    table = np.stack([rounded.time_s, rounded.displacement_mm, rounded.force_N], axis=1)
-    file = tmp_path / "a.csv"
-    np.savetxt(file, table, delimiter=",", header="time_s,displacement_mm,force_N", comments="", fmt="%.17g")
-    found = interpret_record(read_trace(file))
+    write_record(tmp_path / "a.csv", np.stack([getattr(rounded, name) for name in COLUMNS], axis=1))
+    found = interpret_record(read_trace(tmp_path / "a.csv"))
     remark = only(found, "times")
     assert remark.evidence["time_step_s"] == pytest.approx(0.01)
     assert remark.evidence["doubled_times"] == np.sum(np.diff(rounded.time_s) == 0.0)

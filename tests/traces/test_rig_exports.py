@@ -176,12 +176,12 @@ def test_files_that_go_with_a_record_need_its_own_clock(tmp_path):
 # --- LabVIEW
 
 
-def lvm_header(x_columns, units=("Newtons", "mm"), start="0.0", step="0.02", gap="\t"):
+def lvm_header(x_columns, units=("Newtons", "mm"), step="0.02", gap="\t"):
     return [
         "LabVIEW Measurement\t", "Writer_Version\t2", "Reader_Version\t2", "Separator\tTab",
         "Decimal_Separator\t.", "Multi_Headings\tYes", f"X_Columns\t{x_columns}", "Time_Pref\tRelative",
         "Operator\tNN", "Date\t2026/03/01", "Time\t11:59:39.849", "***End_of_Header***\t", "\t",
-        *lvm_segment(units, start, step, gap),
+        *lvm_segment(units, "0.0", step, gap),
     ]  # fmt: skip
 
 

@@ -78,13 +78,11 @@ def test_what_is_wrong_with_a_file_is_told_in_one_line(
     assert caught.value.place
 
 
-def motion(times: np.ndarray, seed: int = 0, sd: float = 0.0) -> SurfaceMotion:
+def motion(times: np.ndarray) -> SurfaceMotion:
     """Two points that go down with time squared."""
     moved = np.zeros((len(times), 2, 3))
     moved[:, :, 2] = -0.1 * times[:, None] ** 2 * [1.0, 2.0]
-    return SurfaceMotion(
-        np.array(AT), times, moved + np.random.default_rng(seed).normal(0.0, sd, moved.shape)
-    )
+    return SurfaceMotion(np.array(AT), times, moved)
 
 
 def test_times_are_of_the_records_clock() -> None:
