@@ -21,10 +21,6 @@ def with_settings(folder: Path, more: str) -> Study:
     return load_study(folder)
 
 
-def names(study: Study) -> set[str]:
-    return {prior.name for prior in build_unknowns(study).priors}
-
-
 def test_a_study_has_no_priors_of_its_own(study: Path) -> None:
     assert build_unknowns(load_study(study)).priors == ()
 
@@ -36,20 +32,23 @@ def test_a_skin_without_fat_below_it_is_skin_with_its_fat(study: Path) -> None:
     assert (found["skin.c_kPa"].median, found["skin.c_kPa"].factor) == (known["median"], known["factor"])
 
 
-def test_over_fat_a_skin_has_no_c(study: Path) -> None:
-    assert names(with_settings(study, THREE + PEOPLE)) == {
-        *("skin.m", "fat.c_kPa", "fat.m", "muscle.c_kPa", "muscle.m")
-    }
+NAMED = {
+    "over fat a skin has no c": (THREE + PEOPLE, "skin.m fat.c_kPa fat.m muscle.c_kPa muscle.m"),
+    "fat of which nothing is to be known is fat all the same": (
+        THREE + PEOPLE + 'prior_tissues = { fat = "none" }\n',
+        "skin.m muscle.c_kPa muscle.m",
+    ),
+    "the study says what another name means": (
+        HIDE + PEOPLE + 'prior_tissues = { hide = "skin_fat", muscle = "none" }\n',
+        "hide.c_kPa hide.m",
+    ),
+}
 
 
-def test_a_layer_of_fat_of_which_nothing_is_to_be_known_is_fat_all_the_same(study: Path) -> None:
-    none = 'prior_tissues = { fat = "none" }\n'
-    assert names(with_settings(study, THREE + PEOPLE + none)) == {"skin.m", "muscle.c_kPa", "muscle.m"}
-
-
-def test_the_study_says_what_another_name_means(study: Path) -> None:
-    found = with_settings(study, HIDE + PEOPLE + 'prior_tissues = { hide = "skin_fat", muscle = "none" }\n')
-    assert names(found) == {"hide.c_kPa", "hide.m"}
+@pytest.mark.parametrize("what", NAMED)
+def test_which_parameters_have_priors(study: Path, what: str) -> None:
+    more, expected = NAMED[what]
+    assert {prior.name for prior in build_unknowns(with_settings(study, more)).priors} == {*expected.split()}
 
 
 def test_what_is_stated_or_fixed_is_not_people_s(study: Path) -> None:
