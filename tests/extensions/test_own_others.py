@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from conftest import write_trace
+from editing import append, edit
 from guide import from_the_guide
 from limbfit import load_study, run_experiment
 from limbfit.anatomy.images.formats import register_image_format
@@ -91,12 +92,9 @@ def named(study: Path, extensions: Path) -> Path:
     for name in ("1.csv", "2.csv"):
         write_trace(study / name, rate=20.0)
     for name in ("stiffness.py", "tapered.py"):
-        (study / name).write_text((extensions / name).read_text())
-    file = study / "study.toml"
-    head, _, rest = file.read_text().partition("[study]\n")
-    assert "[indenter]" not in rest
-    extended = f'{head}[study]\nextensions = ["stiffness.py", "tapered.py"]\n{rest}'
-    file.write_text(extended + '\n[indenter]\nshape = "tapered"\n')
+        shutil.copy(extensions / name, study / name)
+    edit(study, "[study]\n", '[study]\nextensions = ["stiffness.py", "tapered.py"]\n')
+    append(study, '[indenter]\nshape = "tapered"\n')
     return study
 
 

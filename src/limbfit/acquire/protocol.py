@@ -51,14 +51,10 @@ class Settings(AcquireTable):
     """The study's table ``[acquire]``, and which pins hold the limb."""
 
     @property
-    def withdrawn_pins(self) -> tuple[int, ...]:
-        """The two neighbours of the test pin, which stay off the skin so that it can bulge."""
-        return tuple((self.pin - 1 + step) % PINS + 1 for step in (-1, 1))
-
-    @property
     def clamps(self) -> tuple[int, ...]:
-        """The pins that hold the limb."""
-        return tuple(pin for pin in range(1, PINS + 1) if pin != self.pin and pin not in self.withdrawn_pins)
+        """The pins that hold the limb; the two beside the test pin stay off the skin so that it can bulge."""
+        near = [(self.pin - 1 + step) % PINS + 1 for step in (-1, 0, 1)]
+        return tuple(pin for pin in range(1, PINS + 1) if pin not in near)
 
 
 class Phase(StrEnum):

@@ -297,19 +297,19 @@ def _draw_plots(site: str, phase: PhaseUpdate, samples: list[LiveUpdate]) -> Gro
     return Group(head, Text(hint), *plots)
 
 
-def plot(x: list[float], y: list[float], width: int = WIDTH, height: int = HEIGHT) -> str:
+def plot(x: list[float], y: list[float]) -> str:
     """Points drawn with characters, with the smallest and largest value of both axes."""
     if len(x) < 2:
-        return "\n" * (height + 1)
+        return "\n" * (HEIGHT + 1)
     low, high, bottom, top = min(x), max(x), min(0.0, *y), max(*y, 1.0)
-    field = [[" "] * width for _ in range(height)]
+    field = [[" "] * WIDTH for _ in range(HEIGHT)]
     for at, value in zip(x, y):
-        column = round((at - low) / ((high - low) or 1.0) * (width - 1))
-        row = round((value - bottom) / (top - bottom) * (height - 1))
-        field[height - 1 - row][column] = "•"
+        column = round((at - low) / ((high - low) or 1.0) * (WIDTH - 1))
+        row = round((value - bottom) / (top - bottom) * (HEIGHT - 1))
+        field[HEIGHT - 1 - row][column] = "•"
     lines = ["".join(row).rstrip() for row in field]
     lines[0] = f"{top:.1f}".ljust(6) + lines[0][6:]
-    foot = f"{low:.1f}".ljust(width - 8) + f"{high:.1f}".rjust(8)
+    foot = f"{low:.1f}".ljust(WIDTH - 8) + f"{high:.1f}".rjust(8)
     return "\n".join([*lines, foot])
 
 
