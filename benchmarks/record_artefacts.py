@@ -159,7 +159,7 @@ def lost_at_peak(random: Random, press: Press) -> Case:
 def _without(case: Case, start: float, end: float) -> Case:
     trace = case.trace
     kept = (trace.time_s < start) | (trace.time_s > end)
-    return replace(case, trace=Trace(trace.time_s[kept], trace.displacement_mm[kept], trace.force_N[kept]))
+    return replace(case, trace=trace.select(kept))
 
 
 def frozen(random: Random, press: Press) -> Case:
@@ -260,7 +260,7 @@ def doubled_rows(random: Random, press: Press) -> Case:
     rows = np.sort(np.r_[np.arange(n), random.integers(0, n, random.integers(5, 50))])
     return replace(
         case,
-        trace=Trace(case.trace.time_s[rows], case.trace.displacement_mm[rows], case.trace.force_N[rows]),
+        trace=case.trace.select(rows),
     )
 
 
@@ -341,7 +341,7 @@ def _missing(random: Random, press: Press) -> Case:
     case = _case(press, random)
     kept = random.random(press.time_s.size) > 0.3
     trace = case.trace
-    return replace(case, trace=Trace(trace.time_s[kept], trace.displacement_mm[kept], trace.force_N[kept]))
+    return replace(case, trace=trace.select(kept))
 
 
 def _jittered(random: Random, press: Press) -> Case:
