@@ -12,7 +12,6 @@ from pydicom.uid import EnhancedCTImageStorage
 
 from limbfit.anatomy.images.dicom import describe_series
 from limbfit.anatomy.imaging import read_volume
-from limbfit.cli import main
 from limbfit.errors import ImageError
 
 ORDER = [4, 0, 6, 2, 5, 1, 3]
@@ -82,17 +81,12 @@ def test_series_are_listed_with_what_is_wrong_and_without_identity(tmp_path):
     assert not [secret for secret in [*IDENTITY.values(), "DOEJANE"] if secret in told]
 
 
-def test_the_command_lists_them_too(tmp_path, monkeypatch, capsys):
+def test_the_command_lists_them_too(tmp_path, limbfit):
     uid = write_dicom(tmp_path, volume(DIRECTIONS["oblique"]), number=4)
-    monkeypatch.setattr("sys.argv", ["limbfit", "series", str(tmp_path), "--json"])
-    with pytest.raises(SystemExit) as end:
-        main()
-    assert not end.value.code
-    assert json.loads(capsys.readouterr().out) == {"series": describe_series(tmp_path)}
-    monkeypatch.setattr("sys.argv", ["limbfit", "series", str(tmp_path)])
-    with pytest.raises(SystemExit):
-        main()
-    told = capsys.readouterr().out
+    code, listed, _ = limbfit("series", tmp_path, "--json")
+    assert code == 0
+    assert json.loads(listed) == {"series": describe_series(tmp_path)}
+    _, told, _ = limbfit("series", tmp_path)
     assert "series 4: MR, 7 slices of 6 x 5, 0.7 x 1.3 x 2.9 mm, whole" in told
     assert uid in told
 

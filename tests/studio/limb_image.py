@@ -30,5 +30,5 @@ def make_segmented(folder: Path) -> Path:
     part = Volume(fine.array[45:85], fine.spacing, fine.index_to_point([0, 0, 45]), fine.direction)
     write_volume(folder / "image.nrrd", part)
     (folder / "study.toml").write_text(STUDY)
-    run_study(load_study(folder), until="segment", listener=lambda progress: None)
+    run_study(load_study(folder), until="segment")
     return folder

@@ -1,4 +1,4 @@
-"""The studio served by a thread of the tests' own process, which need not be started."""
+"""The studio in the tests' own process, which need not be started: asked itself, or served by a thread."""
 
 import socket
 from collections.abc import Callable, Iterator
@@ -7,10 +7,21 @@ from threading import Thread
 
 import pytest
 import uvicorn
+from fastapi.testclient import TestClient
 
 from limbfit.studio.folder import StudyFolder
 from limbfit.studio.guard import AccessGuard
 from limbfit.studio.server import create_app
+
+
+def open_page(study: Path) -> TestClient:
+    """The page of a study as its browser talks to the studio; an error of the studio is an answer to it."""
+    guard = AccessGuard("127.0.0.1", 8123)
+    origin = f"http://{guard.host}:{guard.port}"
+    app = create_app(StudyFolder(study / "study.toml"), guard)
+    client = TestClient(app, base_url=origin, headers={"Origin": origin}, raise_server_exceptions=False)
+    assert client.get("/", params={"token": guard.token}).status_code == 200
+    return client
 
 
 @pytest.fixture

@@ -8,31 +8,16 @@ import sys
 import nrrd
 import numpy as np
 import pytest
-from fastapi.testclient import TestClient
 from limb_image import make_segmented
+from serving_here import open_page
 
-from limbfit import run_study, study_status
+from limbfit import run_study
 from limbfit.anatomy.imaging import read_labels
 from limbfit.pipeline.engine.store import lock
 from limbfit.studio.folder import StudyFolder
-from limbfit.studio.guard import AccessGuard
 from limbfit.studio.processes import find_running, stop_run
-from limbfit.studio.server import create_app
 from limbfit.study import load_study
-
-HOST = "http://127.0.0.1:8124"
-SENT = {"Origin": HOST}
-
-
-def client_of(folder) -> TestClient:
-    door = AccessGuard("127.0.0.1", 8124)
-    client = TestClient(create_app(StudyFolder(folder / "study.toml"), door), base_url=HOST)
-    client.cookies.set(door.cookie, door.token)
-    return client
-
-
-def states(folder) -> dict[str, str]:
-    return {row["stage"]: row["state"] for row in study_status(load_study(folder))}
+from stages import states
 
 
 @pytest.fixture(scope="module")
@@ -51,13 +36,13 @@ def in_page_order(labels) -> np.ndarray:
 
 
 def test_painted_voxels_and_no_others_change(limb):
-    client, file = client_of(limb), limb / "results" / "segment" / "labels.seg.nrrd"
+    client, file = open_page(limb), limb / "results" / "segment" / "labels.seg.nrrd"
     before = read_labels(file)
     facts = client.get("/api/image").json()["labels"]
     tibia = next(row["value"] for row in facts["names"] if row["name"] == "tibia")
     start = int(np.flatnonzero(in_page_order(before) == 1)[5000])
     runs = [[start, 7, tibia], [start + 20, 3, 0]]
-    answer = client.post("/api/image/labels", headers=SENT, json={"base": facts["base"], "runs": runs}).json()
+    answer = client.post("/api/image/labels", json={"base": facts["base"], "runs": runs}).json()
     expected = in_page_order(before).copy()
     expected[start : start + 7] = tibia
     expected[start + 20 : start + 23] = 0
@@ -68,26 +53,26 @@ def test_painted_voxels_and_no_others_change(limb):
     assert after.names == before.names
     assert states(limb)["segment"] == "stale"
     assert client.get("/api/stages").json()["stages"][0]["state"] == "stale"
-    run_study(load_study(limb), until="segment", listener=lambda progress: None)
+    run_study(load_study(limb), until="segment")
     kept = read_labels(limb / "results" / "by-hand" / "labels.seg.nrrd")
     assert np.array_equal(in_page_order(kept), expected)
 
 
 def test_labels_painted_on_others_are_refused(limb):
-    client, file = client_of(limb), limb / "results" / "segment" / "labels.seg.nrrd"
+    client, file = open_page(limb), limb / "results" / "segment" / "labels.seg.nrrd"
     base = client.get("/api/image").json()["labels"]["base"]
     size = read_labels(file).array.size
     for runs, why in (([[size - 1, 2, 1]], "outside of the label map"), ([[0, 1, 200]], "no label 200")):
-        answer = client.post("/api/image/labels", headers=SENT, json={"base": base, "runs": runs})
+        answer = client.post("/api/image/labels", json={"base": base, "runs": runs})
         assert answer.status_code == 422
         assert why in answer.json()["error"]
     asked = {"base": base, "runs": [[0, 1, 1]]}
     with lock(limb / "results"):
-        answer = client.post("/api/image/labels", headers=SENT, json=asked)
+        answer = client.post("/api/image/labels", json=asked)
         assert answer.status_code == 409
         assert "a run of this study is in progress" in answer.json()["error"]
-    assert client.post("/api/image/labels", headers=SENT, json=asked).status_code == 200
-    second = client.post("/api/image/labels", headers=SENT, json=asked)
+    assert client.post("/api/image/labels", json=asked).status_code == 200
+    second = client.post("/api/image/labels", json=asked)
     assert second.status_code == 409
     assert "have changed since they were opened" in second.json()["error"]
 
@@ -100,10 +85,10 @@ def test_the_studys_own_labels_stay_as_they_are(limb):
     file.write_text(
         file.read_text().replace("[image]", '[segmentation]\nlabels = "given.seg.nrrd"\n\n[image]')
     )
-    run_study(load_study(limb), until="segment", listener=lambda progress: None)
-    client, before = client_of(limb), given.read_bytes()
+    run_study(load_study(limb), until="segment")
+    client, before = open_page(limb), given.read_bytes()
     base = client.get("/api/image").json()["labels"]["base"]
-    answer = client.post("/api/image/labels", headers=SENT, json={"base": base, "runs": [[0, 1, 1]]}).json()
+    answer = client.post("/api/image/labels", json={"base": base, "runs": [[0, 1, 1]]}).json()
     assert answer["saved_to"] == "corrected.seg.nrrd"
     assert given.read_bytes() == before
     assert load_study(limb).segmentation.labels.name == "corrected.seg.nrrd"
@@ -114,7 +99,7 @@ def test_the_studys_own_labels_stay_as_they_are(limb):
 
 def test_image_and_labels_lie_where_the_study_has_them(limb, tmp_path):
     """What the page is given is LPS of the study turned to RAS, voxel for voxel."""
-    client = client_of(limb)
+    client = open_page(limb)
     for what in ("volume", "labels"):
         (tmp_path / f"{what}.nii").write_bytes(client.get(f"/api/image/{what}").content)
     shown = read_labels(tmp_path / "labels.nii")
@@ -134,31 +119,31 @@ def test_stated_times_are_stored_beside_the_comments(study):
     file = study / "study.toml"
     text = file.read_text().replace('trace = "1.csv"', 'trace = "1.csv"  # by the robot')
     file.write_text(text + "[traces]\nsmoothing = 0.1\n")
-    run_study(load_study(study), until="traces", listener=lambda progress: None)
-    client = client_of(study)
+    run_study(load_study(study), until="traces")
+    client = open_page(study)
     found = client.get("/api/traces/1").json()
     later = found["facts"]["touch_down_s"] + 0.25
-    seen = client.post("/api/traces/1/preview", headers=SENT, json={"touch_down_s": later}).json()
+    seen = client.post("/api/traces/1/preview", json={"touch_down_s": later}).json()
     assert seen["facts"]["touch_down_s"] == pytest.approx(later, abs=1e-4)
     assert load_study(study).site("1").touch_down_s is None
-    client.post("/api/traces/1", headers=SENT, json={"touch_down_s": later, "peak_s": 5.7})
+    client.post("/api/traces/1", json={"touch_down_s": later, "peak_s": 5.7})
     stored = load_study(study).site("1")
     assert stored.touch_down_s == pytest.approx(later, abs=1e-4)
     assert stored.peak_s == 5.7
     assert "# by the robot" in file.read_text()
     assert states(study)["traces"] == "stale"
-    run_study(load_study(study), until="traces", listener=lambda progress: None)
+    run_study(load_study(study), until="traces")
     facts = StudyFolder(file).store.results.traces.to_plain()["sites"]["1"]
     assert facts["touch_down_s"] == stored.touch_down_s
     assert facts["peak_s"] == pytest.approx(5.7)
-    client.post("/api/traces/1", headers=SENT, json={})
+    client.post("/api/traces/1", json={})
     assert "touch_down_s" not in file.read_text()
 
 
 def test_times_off_the_record_leave_the_study_as_it_is(study):
-    before, client = (study / "study.toml").read_bytes(), client_of(study)
+    before, client = (study / "study.toml").read_bytes(), open_page(study)
     for times in ({"touch_down_s": 99.0}, {"peak_s": 0.0}, {"touch_down_s": 5.0, "peak_s": 4.0}):
-        answer = client.post("/api/traces/1", headers=SENT, json=times)
+        answer = client.post("/api/traces/1", json=times)
         assert answer.status_code == 422, times
         assert "\n" not in answer.json()["error"]
     assert (study / "study.toml").read_bytes() == before

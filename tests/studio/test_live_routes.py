@@ -6,14 +6,11 @@ import time
 
 import numpy as np
 import pytest
-from fastapi.testclient import TestClient
+from serving_here import open_page
 
 from limbfit.acquire import Recorder
 from limbfit.acquire.line_protocol import PINS, Sample
 from limbfit.acquire.recording import FOLLOWED_BYTES
-from limbfit.studio.folder import StudyFolder
-from limbfit.studio.guard import AccessGuard
-from limbfit.studio.server import create_app
 
 STAMP = "20260102T030405.678"
 HEAD = {
@@ -24,14 +21,7 @@ HEAD = {
 
 @pytest.fixture
 def client(study):
-    door = AccessGuard("127.0.0.1", 8125)
-    client = TestClient(
-        create_app(StudyFolder(study / "study.toml"), door),
-        base_url="http://127.0.0.1:8125",
-        raise_server_exceptions=False,
-    )
-    client.cookies.set(door.cookie, door.token)
-    return client
+    return open_page(study)
 
 
 class Session:

@@ -7,7 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 import pyvista as pv
-from fastapi.testclient import TestClient
+from serving_here import open_page
 
 from completing import complete
 from limbfit import load_study
@@ -15,12 +15,8 @@ from limbfit.mesh import Mesh, boundary_faces, measure_quality, write_vtu
 from limbfit.results.limb import MeshResult
 from limbfit.studio.editing import set_site
 from limbfit.studio.folder import StudyFolder
-from limbfit.studio.guard import AccessGuard
 from limbfit.studio.model_routes import read_anatomy
-from limbfit.studio.server import create_app
 from unpacking import unpack
-
-ORIGIN = "http://127.0.0.1:8123"
 
 
 @pytest.fixture
@@ -28,10 +24,7 @@ def page(study):
     """The stump with comments in its file, as its page talks to it."""
     file = study / "study.toml"
     file.write_text(file.read_text().replace('name = "1"', 'name = "1"  # the first one\nregion = "lateral"'))
-    door = AccessGuard("127.0.0.1", 8123)
-    client = TestClient(create_app(StudyFolder(file), door), base_url=ORIGIN, headers={"Origin": ORIGIN})
-    assert client.get("/", params={"token": door.token}).status_code == 200
-    return client
+    return open_page(study)
 
 
 def skin_points(study, count):

@@ -23,7 +23,7 @@ def meshed(pristine, tmp_path_factory):
     folder = shutil.copytree(pristine, tmp_path_factory.mktemp("meshed") / "study")
     file = folder / "study.toml"
     file.write_text(file.read_text() + COARSE)
-    run_study(load_study(folder), until="mesh", listener=lambda progress: None)
+    run_study(load_study(folder), until="mesh")
     return folder
 
 

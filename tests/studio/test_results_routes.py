@@ -5,30 +5,21 @@ import time
 
 import numpy as np
 import pytest
-from fastapi.testclient import TestClient
+from serving_here import open_page
 from stored_fields import block, fields, write_outcome, write_stored
 
 from completing import complete
 from limbfit.results.runs import SimulateResult
 from limbfit.studio.folder import StudyFolder
-from limbfit.studio.guard import AccessGuard
 from limbfit.studio.processes import find_simulating
 from limbfit.studio.results_routes import FIELDS
-from limbfit.studio.server import create_app
 from unpacking import unpack
-
-ORIGIN = "http://127.0.0.1:8123"
 
 
 @pytest.fixture
 def page(study):
     write_stored(study / "results")
-    door = AccessGuard("127.0.0.1", 8123)
-    client = TestClient(
-        create_app(StudyFolder(study / "study.toml"), door), base_url=ORIGIN, headers={"Origin": ORIGIN}
-    )
-    assert client.get("/", params={"token": door.token}).status_code == 200
-    return client
+    return open_page(study)
 
 
 def test_what_can_be_played_is_told_with_its_times(page, study):

@@ -2,15 +2,11 @@
 
 import numpy as np
 import pytest
-from fastapi.testclient import TestClient
+from serving_here import open_page
 
 from limbfit import load_study
-from limbfit.studio.folder import StudyFolder
-from limbfit.studio.guard import AccessGuard
-from limbfit.studio.server import create_app
 from unpacking import unpack
 
-ORIGIN = "http://127.0.0.1:8123"
 AREA = {"name": "front", "position": [0.0, -41.0, 60.0], "radius_mm": 25.0, "depth_mm": 4.0}
 
 
@@ -19,10 +15,7 @@ def page(study):
     """The stump with a socket and a comment in its file, as its page talks to it."""
     file = study / "study.toml"
     file.write_text(file.read_text() + "[socket]\ntrim_mm = 34.0  # of the brim\n")
-    door = AccessGuard("127.0.0.1", 8123)
-    client = TestClient(create_app(StudyFolder(file), door), base_url=ORIGIN, headers={"Origin": ORIGIN})
-    assert client.get("/", params={"token": door.token}).status_code == 200
-    return client
+    return open_page(study)
 
 
 def test_areas_of_the_page_are_areas_of_the_study_and_press_the_face_in(page, study):

@@ -11,15 +11,12 @@ from limb_image import make_segmented
 from serving_here import serve_here as serve_here
 
 from browsing import serious_findings, until
-from limbfit import run_study, study_status
+from limbfit import run_study
 from limbfit.anatomy.imaging import read_labels
 from limbfit.study import load_study
+from stages import states
 
 SIZES = ((1280, 800), (1920, 1080))
-
-
-def states(folder) -> dict[str, str]:
-    return {row["stage"]: row["state"] for row in study_status(load_study(folder))}
 
 
 def test_a_dragged_touch_down_is_stored_and_hostile_names_stay_text(study, serve_here, open_page):
@@ -27,7 +24,7 @@ def test_a_dragged_touch_down_is_stored_and_hostile_names_stay_text(study, serve
     hostile = "<img src=x onerror=window.hacked=1><script>window.hacked=1</script>"
     text = file.read_text().replace('"stump"', f'"{hostile}"')
     file.write_text(text.replace('name = "1"', f'name = "1"  # first\nregion = "{hostile}"'))
-    run_study(load_study(study), until="traces", listener=lambda progress: None)
+    run_study(load_study(study), until="traces")
     address = serve_here(study)
     page = open_page(address + "#/traces")
     handle = page.locator("[data-key=touch_down_s]").first
@@ -103,7 +100,7 @@ def test_a_calibration_is_started_watched_reloaded_stopped_and_resumed(
 ):
     file = study / "study.toml"
     file.write_text(file.read_text() + coarse_settings.replace("max_iterations = 2", "max_iterations = 12"))
-    run_study(load_study(study), until="mesh", listener=lambda progress: None)
+    run_study(load_study(study), until="mesh")
     page = open_page(serve(study) + "#/identification")
     iterates = re.compile(r"(\d+) iterates")
 
@@ -204,7 +201,7 @@ def test_memory_of_server_and_page_stays_level(study, coarse_settings, serve, op
     """A study that writes a log line all the time, watched for three minutes, with views opened in turn."""
     file = study / "study.toml"
     file.write_text(file.read_text() + coarse_settings)
-    run_study(load_study(study), until="traces", listener=lambda progress: None)
+    run_study(load_study(study), until="traces")
     page = open_page(serve(study) + "#/identification")
     server = next(p for p in psutil.Process().children() if "studio" in p.cmdline())
     client = page.context.new_cdp_session(page)

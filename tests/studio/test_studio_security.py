@@ -1,6 +1,7 @@
 """Who gets in: one secret, this host, this origin; files of the study only; what is hostile stays text."""
 
 import itertools
+import re
 import socket
 import threading
 import time
@@ -61,24 +62,12 @@ def templates(app) -> list[tuple[str, str]]:
 
 def routes(app) -> list[tuple[str, str]]:
     """The same with a plain word for each parameter."""
-    return sorted({(method, _filled(path)) for method, path in templates(app)})
+    return sorted({(method, _filled(path, "1")) for method, path in templates(app)})
 
 
-def _filled(path: str) -> str:
-    return "".join("1" if part.startswith("{") else part for part in _pieces(path))
-
-
-def _pieces(path: str) -> list[str]:
-    parts, word = [], ""
-    for c in path:
-        if c == "{":
-            parts.append(word)
-            word = ""
-        word += c
-        if c == "}":
-            parts.append(word)
-            word = ""
-    return [*parts, word]
+def _filled(path: str, word: str) -> str:
+    """The path with the word for each parameter."""
+    return re.sub(r"\{[^}]*\}", word, path)
 
 
 def test_all_routes_are_known_to_these_tests(app):
@@ -230,8 +219,7 @@ def test_no_parameter_leads_out_of_the_results(app, page, study):
 def _with(template: str, plain: str, last: str) -> str:
     """The path with ``last`` as its last parameter and ``plain`` as the others."""
     head, _, tail = template.rpartition("{")
-    filled = "".join(plain if part.startswith("{") else part for part in _pieces(head))
-    return filled + last + tail.partition("}")[2]
+    return _filled(head, plain) + last + tail.partition("}")[2]
 
 
 @pytest.mark.parametrize(

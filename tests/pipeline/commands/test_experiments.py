@@ -14,10 +14,7 @@ from limbfit.pipeline.commands.experiments import EXPERIMENTS, Experiment, regis
 from limbfit.pipeline.commands.run import compute_keys
 from limbfit.pipeline.engine.store import write_json
 from limbfit.study import load_study
-
-
-class StoppedError(Exception):
-    """Stands for a kill: nothing in limbfit catches it."""
+from stages import StoppedError, states, stop_at
 
 
 def run_peaks(context, folder, *, factor: float = 1.0, parameters_from: str = ""):
@@ -56,8 +53,7 @@ def peaks():
 
 
 def state(study, name: str = "peaks") -> str:
-    rows = {row["stage"]: row["state"] for row in study_status(load_study(study))}
-    return rows.get(name, "missing")
+    return states(study).get(name, "missing")
 
 
 def test_an_experiment_is_done_once_after_the_stages_it_needs(study):
@@ -74,10 +70,7 @@ def test_an_experiment_is_done_once_after_the_stages_it_needs(study):
 
 @pytest.mark.parametrize("options", [{}, {"factor": 2.0}], ids=["its defaults", "others"])
 def test_a_stopped_experiment_has_begun_and_goes_on_in_its_own_folder(study, options):
-    def stop(event: Progress) -> None:
-        if event.text == "halfway":
-            raise StoppedError
-
+    stop = stop_at("halfway")
     with pytest.raises(StoppedError):
         run_experiment(load_study(study), "peaks", **options, listener=stop)
     assert state(study) == "begun"

@@ -3,7 +3,6 @@
 import gzip
 import os
 import resource
-import sys
 from contextlib import suppress
 
 import pytest
@@ -14,22 +13,15 @@ from conftest import write_trace
 from editing import append, edit
 from limbfit import run_study
 from limbfit.anatomy.imaging import read_labels
-from limbfit.cli import main
 from limbfit.errors import InputError, LabelError, RunError
 from limbfit.study import load_study
 
 SETTINGS = {"deadline": None, "suppress_health_check": list(HealthCheck), "derandomize": True}
 
 
-def check(folder, monkeypatch, capsys, *verb: str) -> str:
+def check(folder, limbfit, *verb: str) -> str:
     """``limbfit check``, or another verb: the exit code must be 0 or 2; what stands on standard error."""
-    monkeypatch.setattr(sys, "argv", ["limbfit", *(verb or ["check"]), str(folder)])
-    try:
-        main()
-        code = 0
-    except SystemExit as end:
-        code = end.code or 0
-    err = capsys.readouterr().err
+    code, _, err = limbfit(*(verb or ["check"]), folder)
     assert code in (0, 2), err
     assert "Traceback" not in err
     if code == 2:
@@ -57,7 +49,7 @@ def damaged(content: bytes, changes) -> bytes:
 
 
 @pytest.mark.slow
-def test_five_hundred_damaged_files(study, monkeypatch, capsys):
+def test_five_hundred_damaged_files(study, limbfit):
     """Each example damages one of the study's files and checks it; what passes is run up to its meshes."""
     names = ["study.toml", "study.toml", "1.csv", "1.csv", "tibia.stl"]
     whole = {name: (study / name).read_bytes() for name in set(names)}
@@ -67,8 +59,8 @@ def test_five_hundred_damaged_files(study, monkeypatch, capsys):
     def run(name, changes):
         (study / name).write_bytes(damaged(whole[name], changes))
         try:
-            if "error: " not in check(study, monkeypatch, capsys):
-                check(study, monkeypatch, capsys, "run", "--until", "traces")
+            if "error: " not in check(study, limbfit):
+                check(study, limbfit, "run", "--until", "traces")
         finally:
             (study / name).write_bytes(whole[name])
 
@@ -91,9 +83,9 @@ def test_damaged_study_files_are_read_or_refused(tmp_path_factory, changes):
 
 
 @pytest.mark.parametrize("name", ["study.toml", "1.csv", "skin.stl"])
-def test_fifty_megabytes_of_zeros(study, monkeypatch, capsys, name):
+def test_fifty_megabytes_of_zeros(study, limbfit, name):
     (study / name).write_bytes(bytes(50_000_000))
-    assert "error: " in check(study, monkeypatch, capsys)
+    assert "error: " in check(study, limbfit)
 
 
 LAUGHS = (
@@ -103,15 +95,15 @@ LAUGHS = (
 )
 
 
-def test_a_billion_laughs_in_a_surface(study, monkeypatch, capsys):
+def test_a_billion_laughs_in_a_surface(study, limbfit):
     (study / "skin.vtp").write_bytes(LAUGHS)
     edit(study, "skin.stl", "skin.vtp")
-    assert "error: " in check(study, monkeypatch, capsys)
+    assert "error: " in check(study, limbfit)
 
 
-def test_deeply_nested_toml_is_refused(study, monkeypatch, capsys):
+def test_deeply_nested_toml_is_refused(study, limbfit):
     append(study, "\nx = " + "[" * 5000 + "]" * 5000)
-    assert "error: " in check(study, monkeypatch, capsys)
+    assert "error: " in check(study, limbfit)
 
 
 def of_an_image(study, name: str) -> None:
@@ -120,12 +112,12 @@ def of_an_image(study, name: str) -> None:
     edit(study, 'bones = { tibia = "tibia.stl" }\n', "")
 
 
-def test_a_bomb_of_zeros_in_a_compressed_image(study, monkeypatch, capsys):
+def test_a_bomb_of_zeros_in_a_compressed_image(study, limbfit):
     with gzip.open(study / "image.nii.gz", "wb", compresslevel=1) as stream:
         for _ in range(100):
             stream.write(bytes(1_000_000))
     of_an_image(study, "image.nii.gz")
-    assert "error: " in check(study, monkeypatch, capsys)
+    assert "error: " in check(study, limbfit)
 
 
 HUGE = b"NRRD0004\ntype: short\ndimension: 3\nspace: left-posterior-superior\nsizes: %s\n" + (
@@ -134,10 +126,10 @@ HUGE = b"NRRD0004\ntype: short\ndimension: 3\nspace: left-posterior-superior\nsi
 )
 
 
-def test_an_image_that_states_more_voxels_than_memory_is_refused_unread(study, monkeypatch, capsys):
+def test_an_image_that_states_more_voxels_than_memory_is_refused_unread(study, limbfit):
     (study / "image.nrrd").write_bytes(HUGE % b"9000 9000 9000" + gzip.compress(bytes(1_000_000)))
     of_an_image(study, "image.nrrd")
-    assert "9000 x 9000 x 9000 voxels" in check(study, monkeypatch, capsys)
+    assert "9000 x 9000 x 9000 voxels" in check(study, limbfit)
 
 
 @pytest.mark.parametrize("size", [b"64 64 64", b"9000 9000 9000"])
@@ -150,18 +142,18 @@ def test_a_bomb_in_a_label_map_is_refused_unread(tmp_path, size):
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 50_000  # kB
 
 
-def test_a_surface_that_states_any_number_of_points_is_refused_unread(study, monkeypatch, capsys):
+def test_a_surface_that_states_any_number_of_points_is_refused_unread(study, limbfit):
     text = (
         '<?xml version="1.0"?><VTKFile type="PolyData" compressor="vtkZLibDataCompressor"><PolyData>'
         '<Piece NumberOfPoints="90000000000" NumberOfPolys="1"></Piece></PolyData></VTKFile>'
     )
     (study / "skin.vtp").write_text(text)
     edit(study, "skin.stl", "skin.vtp")
-    assert "points or faces" in check(study, monkeypatch, capsys)
+    assert "points or faces" in check(study, limbfit)
 
 
 @pytest.mark.parametrize("way", ["link", "path"])
-def test_a_trace_out_of_the_study_gives_away_nothing(study, monkeypatch, capsys, way):
+def test_a_trace_out_of_the_study_gives_away_nothing(study, limbfit, way):
     secret = study.parent / "secret.txt"
     secret.write_text("root:x:0:0:secret\n" * 20)
     if way == "link":
@@ -169,15 +161,15 @@ def test_a_trace_out_of_the_study_gives_away_nothing(study, monkeypatch, capsys,
         (study / "2.csv").symlink_to(secret)
     else:
         edit(study, '"2.csv"', '"../secret.txt"')
-    err = check(study, monkeypatch, capsys)
+    err = check(study, limbfit)
     assert "error: " in err
     assert "root:x" not in err
 
 
 @pytest.mark.parametrize("name", ["../../x", "a/b", "a\\u0000b", "\\u001b[2J", "", "x" * 300])
-def test_names_that_would_leave_the_folder_or_the_line_are_refused(study, monkeypatch, capsys, name):
+def test_names_that_would_leave_the_folder_or_the_line_are_refused(study, limbfit, name):
     edit(study, 'name = "1"', f'name = "{name}"')
-    err = check(study, monkeypatch, capsys)
+    err = check(study, limbfit)
     assert "sites.1.name" in err
     assert "\x1b" not in err
 

@@ -8,28 +8,17 @@ import pytest
 
 from conftest import COARSE
 from editing import append, edit
-from limbfit import Progress, run_study, simulate_site, study_status
+from limbfit import run_study, simulate_site
 from limbfit.errors import InputError
 from limbfit.mesh import read_vtu
 from limbfit.study import load_study
+from stages import StoppedError, states, stop_at
 
 
 @pytest.fixture
 def coarse(study):
     append(study, COARSE)
     return study
-
-
-class StoppedError(Exception):
-    """Stands for a kill: nothing in limbfit catches it."""
-
-
-def stop_at(text: str):
-    def listen(event: Progress) -> None:
-        if text in event.text:
-            raise StoppedError
-
-    return listen
 
 
 def finished_simulations(study) -> dict[str, int]:
@@ -43,9 +32,9 @@ def test_interrupted_calibration_goes_on_and_ends_the_same(coarse, tmp_path_fact
         run_study(load_study(coarse), listener=stop_at("evaluation 3"))
     kept = finished_simulations(coarse)
     assert len(kept) >= 2
-    states = {row["stage"]: row["state"] for row in study_status(load_study(coarse))}
-    assert states["mesh"] == "done"
-    assert states["calibrate"] == "begun"
+    found = states(coarse)
+    assert found["mesh"] == "done"
+    assert found["calibrate"] == "begun"
     resumed = run_study(load_study(coarse))
     runs = coarse / "results/calibrate/runs"
     assert all((runs / name).stat().st_mtime_ns == stamp for name, stamp in kept.items())
@@ -176,9 +165,9 @@ def test_three_tissues_from_surfaces_to_report(coarse):
     report = (results / "report/report.html").read_text()
     assert "first as one material, then as skin, fat and calf." in report
     assert "outermost first: skin (2.0 mm), fat (6.0 mm)" in report
-    before = {row["stage"]: row["state"] for row in study_status(load_study(coarse))}
+    before = states(coarse)
     assert set(before.values()) == {"done"}
     edit(coarse, '"calf"', '"muscle"')
-    after = {row["stage"]: row["state"] for row in study_status(load_study(coarse))}
+    after = states(coarse)
     assert {after[stage] for stage in ("mesh", "calibrate", "predict", "report")} == {"stale"}
     assert after["traces"] == "done"

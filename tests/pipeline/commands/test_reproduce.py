@@ -9,12 +9,13 @@ import pytest
 
 from conftest import COARSE
 from editing import append, edit
-from limbfit import Progress, reproduce_study, run_study
+from limbfit import reproduce_study, run_study
 from limbfit.anatomy.grid import Volume
 from limbfit.anatomy.imaging import read_volume, write_volume
 from limbfit.errors import InputError
 from limbfit.pipeline.commands.run import run_record
 from limbfit.study import load_study
+from stages import StoppedError, stop_at
 
 
 def test_what_is_no_record_is_refused(study, tmp_path):
@@ -26,14 +27,6 @@ def test_what_is_no_record_is_refused(study, tmp_path):
         record.write_text(text)
         with pytest.raises(InputError, match="not the record of a run"):
             reproduce_study(record, tmp_path / "again")
-
-
-class StoppedError(Exception):
-    """Ends a run before it does anything."""
-
-
-def stop(event: Progress) -> None:
-    raise StoppedError
 
 
 def test_an_image_goes_with_its_voxels_and_a_study_by_any_name_into_no_folder_of_another(study, tmp_path):
@@ -50,20 +43,20 @@ def test_an_image_goes_with_its_voxels_and_a_study_by_any_name_into_no_folder_of
     (named.results / "run.json").write_text(json.dumps(record))
     for _ in ("first", "the attempt goes on"):
         with pytest.raises(StoppedError):
-            reproduce_study(study / "limb.toml", tmp_path / "again", listener=stop)
+            reproduce_study(study / "limb.toml", tmp_path / "again", listener=stop_at())
     other = tmp_path / "another"
     other.mkdir()
     (other / "study.toml").write_text("of another patient")
     for taken in (other, other / "study.toml", study):
         with pytest.raises(InputError, match="holds something else"):
-            reproduce_study(study / "limb.toml", taken, listener=stop)
+            reproduce_study(study / "limb.toml", taken, listener=stop_at())
     assert (other / "study.toml").read_text() == "of another patient"
     again = load_study(tmp_path / "again")
     assert read_volume(again.path(again.image.path)).size == (7, 6, 5)
     changed = Volume(image.array + 1.0, image.spacing, image.origin, image.direction)
     write_volume(study / "scan [1].mhd", changed)
     with pytest.raises(InputError, match=r"has changed since: image\.path"):
-        reproduce_study(study / "limb.toml", tmp_path / "other", listener=stop)
+        reproduce_study(study / "limb.toml", tmp_path / "other", listener=stop_at())
 
 
 def test_an_attempt_that_was_ended_while_it_copied_goes_on(study, tmp_path):
@@ -75,11 +68,11 @@ def test_an_attempt_that_was_ended_while_it_copied_goes_on(study, tmp_path):
     resource.setrlimit(resource.RLIMIT_FSIZE, (2000, before[1]))  # Python ignores the signal
     try:
         with pytest.raises(OSError, match="too large"):
-            reproduce_study(study, tmp_path / "again", listener=stop)
+            reproduce_study(study, tmp_path / "again", listener=stop_at())
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
     with pytest.raises(StoppedError):
-        reproduce_study(study, tmp_path / "again", listener=stop)
+        reproduce_study(study, tmp_path / "again", listener=stop_at())
     assert (tmp_path / "again/skin.stl").read_bytes() == (study / "skin.stl").read_bytes()
 
 

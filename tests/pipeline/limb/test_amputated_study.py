@@ -44,7 +44,7 @@ def build_surfaces(folder: Path, labels: LabelMap, geometry: str) -> Anatomy:
     write_volume(folder / "image.nrrd", image)
     (folder / "study.toml").write_text(TEXT.format(geometry=geometry))
     study = load_study(folder)
-    run_study(study, until="surfaces", listener=lambda progress: None)
+    run_study(study, until="surfaces")
     return load_anatomy(study.results / "surfaces")
 
 

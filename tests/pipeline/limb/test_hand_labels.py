@@ -12,9 +12,9 @@ from limbfit.anatomy.imaging import read_labels, write_labels, write_volume
 from limbfit.errors import StudyError
 from limbfit.phantom.geometry import make_limb
 from limbfit.phantom.mri import make_grid
-from limbfit.pipeline.commands.run import study_status
 from limbfit.study import Study, load_study
 from scanned import build_image
+from stages import states
 
 TEXT = """
 [study]
@@ -48,16 +48,12 @@ def study_of(folder: Path, more: str = "") -> Study:
 
 
 def segmented(study: Study) -> LabelMap:
-    run_study(study, until="segment", listener=lambda progress: None)
+    run_study(study, until="segment")
     return read_labels(study.results / "segment" / "labels.seg.nrrd")
 
 
 def facts(study: Study) -> dict:
     return json.loads((study.results / "segment" / "segment.json").read_text())
-
-
-def state(study: Study) -> str:
-    return next(row["state"] for row in study_status(study) if row["stage"] == "segment")
 
 
 def with_a_notch(labels: LabelMap) -> LabelMap:
@@ -75,17 +71,17 @@ def test_hand_work_in_the_results_wins_and_survives(folder):
     """Saved over the stored map it is used through changed settings and repeated runs, and kept as it is."""
     study = study_of(folder)
     first = segmented(study)
-    assert state(study) == "done"
+    assert states(folder)["segment"] == "done"
     file = study.results / "segment" / "labels.seg.nrrd"
     corrected = with_a_notch(first)
     write_labels(file, corrected)
     saved = file.read_bytes()
-    assert state(study) == "stale"
+    assert states(folder)["segment"] == "stale"
     for more in ("", "", "[segmentation]\nmin_bone_volume_mm3 = 900.0\n"):
         study = study_of(folder, more)
         assert np.array_equal(segmented(study).array, corrected.array)
         assert facts(study)["method"] == "corrected by hand"
-        assert state(study) == "done"
+        assert states(folder)["segment"] == "done"
     assert (study.results / "by-hand" / "labels.seg.nrrd").read_bytes() == saved
     (study.results / "by-hand" / "labels.seg.nrrd").unlink()
     assert np.array_equal(segmented(study).array, first.array)

@@ -15,10 +15,6 @@ SEED = 3
 TOLERANCE_MM = 1.5  # voxels of 2.4 mm
 
 
-def silent(_: object) -> None:
-    pass
-
-
 def write_study(folder, image: str, sites) -> None:
     tables = [f'[study]\nname = "marked"\n[image]\n{image}\n[geometry]\nsurface_edge_mm = 4.0\n']
     for site in sites:
@@ -48,7 +44,7 @@ def test_sites_are_where_the_markers_were(scans, way: str) -> None:
         write_study(folder, 'path = "plain"\nmarkers = "marked"', plain)
     else:
         write_study(folder, 'path = "marked"\nmarkers = "same"', marked)
-    found = limbfit.show_stage(limbfit.load_study(folder), "sites", listener=silent)
+    found = limbfit.show_stage(limbfit.load_study(folder), "sites")
     truth = {site.name: site.position for site in (plain if way == "second image" else marked)}
     errors = [np.linalg.norm(np.array(s["position_mm"]) - truth[s["site"]]) for s in found["sites"]]
     assert len(errors) == 18
