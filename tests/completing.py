@@ -1,10 +1,12 @@
 """Stored results of which a test states what it is about."""
 
+import json
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from types import UnionType
 from typing import Any, Union, get_args, get_origin
 
-from limbfit.results.base import ResultPart
+from limbfit.results.base import ResultPart, StoredResult
 
 
 def complete(model: type[ResultPart], content: Any) -> Any:
@@ -16,6 +18,13 @@ def complete(model: type[ResultPart], content: Any) -> Any:
             elif field.is_required():
                 content[key] = _make_empty(field.annotation)
     return content
+
+
+def write_result(results: Path, model: type[StoredResult], content: Any, name: str = "") -> None:
+    """Write the content, completed, into the model's file below the results; ``name`` is the star's."""
+    file = results / model.FILE.replace("*", name)
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.write_text(json.dumps(complete(model, content)))
 
 
 def _complete_value(kind: Any, value: Any) -> Any:

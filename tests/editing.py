@@ -1,7 +1,10 @@
-"""Studies and records as a user writes and changes them, and what a change makes stale."""
+"""Studies and records as users write and change them, what is stored, and what a change makes stale."""
 
-from collections.abc import Callable, Sequence
+import json
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -44,3 +47,11 @@ def list_stale(before: Study, after: Study) -> set[str]:
     """The stages of a study that are others in another study."""
     then, now = compute_keys(before), compute_keys(after)
     return {stage for stage in then if then[stage] != now[stage]}
+
+
+@contextmanager
+def rewritten(file: Path) -> Iterator[Any]:
+    """The content of a stored JSON file, which is written again with what is changed of it within."""
+    content = json.loads(file.read_text())
+    yield content
+    file.write_text(json.dumps(content))

@@ -10,10 +10,13 @@ import pytest
 import pyvista as pv
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 
-from completing import complete
+from completing import write_result
+from editing import rewritten
 from limbfit.laws import LAWS, OGDEN
 from limbfit.mesh import Mesh, write_vtu
-from limbfit.results.study_results import MODELS
+from limbfit.results.identification import CalibrationResult, PredictResult
+from limbfit.results.limb import MeshResult, SegmentResult, SitesResult, SurfacesResult, TracesResult
+from limbfit.results.runs import RunResult
 
 SITES = (
     ("PT-1", "patellar tendon", True, -1.45, 10.0),
@@ -85,20 +88,18 @@ def add_fat(folder: Path) -> Path:
     content["bounds"] = {"lower": three["start"], "upper": three["start"]}
     file.write_text(json.dumps(content))
     truth.write_text(json.dumps({"parameters": with_fat(TRUTH, FAT)}))
-    meshes = json.loads((folder / "mesh" / "mesh.json").read_text())
-    for facts in meshes["sites"].values():
-        facts["layer_thickness_mm"] = {
-            "skin": {"mean": 1.5, "std": 0.01, "min": 1.4, "max": 1.6},
-            "fat": {"mean": 4.72, "std": 1.31, "min": 1.0, "max": 8.0},
-        }
-    (folder / "mesh" / "mesh.json").write_text(json.dumps(meshes))
-    run = json.loads((folder / "run.json").read_text())
+    with rewritten(folder / "mesh" / "mesh.json") as meshes:
+        for facts in meshes["sites"].values():
+            facts["layer_thickness_mm"] = {
+                "skin": {"mean": 1.5, "std": 0.01, "min": 1.4, "max": 1.6},
+                "fat": {"mean": 4.72, "std": 1.31, "min": 1.0, "max": 8.0},
+            }
     layers = [
         {"name": "skin", "thickness_mm": 1.5},
         {"name": "fat", "thickness": "map", "min_thickness_mm": 1.0},
     ]
-    run["settings"]["geometry"] |= {"layers": layers, "core": "muscle"}
-    (folder / "run.json").write_text(json.dumps(run))
+    with rewritten(folder / "run.json") as run:
+        run["settings"]["geometry"] |= {"layers": layers, "core": "muscle"}
     return folder
 
 
@@ -106,27 +107,19 @@ def write_results(
     folder: Path, *, sites: tuple = SITES, name: str = "Phantom 7 (coarse)", geometry: bool = True
 ) -> Path:
     """Every artefact of a finished study below ``folder``; without the geometry, which only pictures need."""
-    _json(folder / "run.json", _run(sites, name))
-    _json(folder / "truth.json", {"parameters": TRUTH})
-    _surfaces(folder / "surfaces", geometry)
+    write_result(folder, RunResult, _run(sites, name))
+    (folder / "truth.json").write_text(json.dumps({"parameters": TRUTH}))
+    _surfaces(folder, geometry)
     volumes = {"muscle": 902.4, "tibia": 118.0, "fibula": 17.3, "skin": 151.2}
-    _json(folder / "segment" / "segment.json", {"volumes_cm3": volumes, "method": "bias-corrected threshold"})
-    _json(folder / "sites" / "sites.json", {"sites": [_site(i, row) for i, row in enumerate(sites)]})
-    _traces(folder / "traces", sites)
+    write_result(folder, SegmentResult, {"volumes_cm3": volumes, "method": "bias-corrected threshold"})
+    write_result(folder, SitesResult, {"sites": [_site(i, row) for i, row in enumerate(sites)]})
+    _traces(folder, sites)
     _meshes(folder, sites)
-    _json(folder / "calibrate" / "calibration.json", _calibration(sites))
-    _predict(folder / "predict", sites)
+    write_result(folder, CalibrationResult, _calibration(sites))
+    _predict(folder, sites)
     if geometry:
         _write_meshes(folder, sites)
     return folder
-
-
-def _json(file: Path, content: dict) -> None:
-    models = {Path(model.FILE).name: model for model in MODELS.values()}
-    if file.name in models:
-        content = complete(models[file.name], content)
-    file.parent.mkdir(parents=True, exist_ok=True)
-    file.write_text(json.dumps(content, indent=1))
 
 
 def _csv(file: Path, **columns: np.ndarray) -> None:
@@ -161,18 +154,15 @@ def _run(sites: tuple, name: str) -> dict:
 
 
 def _surfaces(folder: Path, geometry: bool) -> None:
-    folder.mkdir(parents=True, exist_ok=True)
+    facts = {
+        "cut_point": [0, 0, 60],
+        "cut_normal": [0, 0, 1],
+        "skin": {"volume_mm3": 1153100.0},
+        "bones": {"tibia": {"volume_mm3": 117200.0}},
+    }
+    write_result(folder, SurfacesResult, facts)
     if geometry:
-        _bodies(folder)
-    _json(
-        folder / "surfaces.json",
-        {
-            "cut_point": [0, 0, 60],
-            "cut_normal": [0, 0, 1],
-            "skin": {"volume_mm3": 1153100.0},
-            "bones": {"tibia": {"volume_mm3": 117200.0}},
-        },
-    )
+        _bodies(folder / "surfaces")
 
 
 def _bodies(folder: Path) -> None:
@@ -225,8 +215,9 @@ def _traces(folder: Path, sites: tuple) -> None:
         raw_time = np.concatenate([before, time]) + 1.3
         raw_d = np.concatenate([before * 0.96, d]) + 1.25
         raw_force = np.concatenate([0 * before, force]) + 0.05 * rng.standard_normal(520)
-        _csv(folder / f"{row[0]}-raw.csv", time_s=raw_time, displacement_mm=raw_d, force_N=raw_force)
-        _csv(folder / f"{row[0]}.csv", time_s=time, displacement_mm=d, force_N=force)
+        raw = {"time_s": raw_time, "displacement_mm": raw_d, "force_N": raw_force}
+        _csv(folder / "traces" / f"{row[0]}-raw.csv", **raw)
+        _csv(folder / "traces" / f"{row[0]}.csv", time_s=time, displacement_mm=d, force_N=force)
         facts[row[0]] = {
             "site": row[0],
             "touch_down_s": 1.3,
@@ -240,7 +231,7 @@ def _traces(folder: Path, sites: tuple) -> None:
             "phases": _phases(float(before[0]) + 1.3, 1.3, float(time[-1])),
             "phases_in_words": "load at 0.96 mm/s, hold for 2 s, unload at 0.96 mm/s",
         }
-    _json(folder / "traces.json", {"sites": facts})
+    write_result(folder, TracesResult, {"sites": facts})
 
 
 def _phases(first_s: float, touch_s: float, seconds: float) -> list[dict]:
@@ -289,7 +280,7 @@ def _meshes(folder: Path, sites: tuple) -> None:
             "warnings": ["the layer is thin at the tibial crest"] if i == 1 else [],
             "seconds": 15.2,
         }
-    _json(folder / "mesh" / "mesh.json", {"sites": facts})
+    write_result(folder, MeshResult, {"sites": facts})
 
 
 def _write_meshes(folder: Path, sites: tuple) -> None:
@@ -391,7 +382,7 @@ def _predict(folder: Path, sites: tuple) -> None:
         two, one = force * (1.01 + 0.004 * i), force * (0.96 - 0.005 * i)
         band = 0.03 * force
         _csv(
-            folder / f"{row[0]}.csv",
+            folder / "predict" / f"{row[0]}.csv",
             time_s=time,
             displacement_mm=d,
             force_measured_N=force,
@@ -422,4 +413,4 @@ def _predict(folder: Path, sites: tuple) -> None:
         "mean_error_heldout_percent": 1.6,
         "sd_error_heldout_percent": 0.2,
     }
-    _json(folder / "predict.json", {"sites": rows} | means)
+    write_result(folder, PredictResult, {"sites": rows} | means)

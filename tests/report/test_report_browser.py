@@ -1,11 +1,10 @@
 """The report as a file in a real browser: nothing is asked for, and its figures answer."""
 
-import json
-
 import pytest
 from stored_results import SITES, write_results
 
 from browsing import WITHOUT_WEBGL, until
+from editing import rewritten
 from limbfit.report import build_report
 
 pytestmark = pytest.mark.slow
@@ -17,9 +16,8 @@ def address(tmp_path_factory: pytest.TempPathFactory) -> str:
     """Two sites, one with fields; a region, a bone and the study with names that would end a script."""
     results = write_results(tmp_path_factory.mktemp("study") / "results", sites=SITES[3:5], name=HOSTILE)
     for file in (results / "sites" / "sites.json", results / "predict" / "predict.json"):
-        content = json.loads(file.read_text())
-        content["sites"][0]["region"] = HOSTILE
-        file.write_text(json.dumps(content))
+        with rewritten(file) as content:
+            content["sites"][0]["region"] = HOSTILE
     return build_report(results, results / "report").as_uri()
 
 

@@ -15,6 +15,7 @@ from page_outline import Outline, section_of, without_scripts
 from stored_results import SITES as ALL_SITES
 from stored_results import write_results
 
+from editing import rewritten
 from limbfit.report import build_report
 from limbfit.report.sections.methods import write_method_parts
 from limbfit.report.store import load_store
@@ -145,9 +146,8 @@ def test_site_table_marks_the_fitted(report: str) -> None:
 
 def test_labels_of_an_image_that_the_study_has_no_more_are_not_reported(tmp_path: Path) -> None:
     folder = write_results(tmp_path / "results", geometry=False)
-    run = json.loads((folder / "run.json").read_text())
-    del run["stages"]["segment"]
-    (folder / "run.json").write_text(json.dumps(run))
+    with rewritten(folder / "run.json") as run:
+        del run["stages"]["segment"]
     assert load_store(folder).segment is None
 
 

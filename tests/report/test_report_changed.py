@@ -9,7 +9,8 @@ import pytest
 from page_outline import Outline, render_sections, section_of, without_scripts
 from stored_results import SITES, add_fat, leave_unarranged, write_results
 
-from completing import complete
+from completing import complete, write_result
+from editing import rewritten
 from limbfit import compress_cube, load_study
 from limbfit.errors import InputError
 from limbfit.pipeline.commands.run import compute_keys
@@ -131,37 +132,31 @@ def test_no_truth_no_band(copy: Path) -> None:
 
 
 def test_results_of_another_version_are_refused_with_the_command_that_makes_them_anew(copy: Path) -> None:
-    file = copy / "calibrate" / "calibration.json"
-    content = json.loads(file.read_text())
-    del content["uncertainty"]
-    file.write_text(json.dumps(content))
+    with rewritten(copy / "calibrate" / "calibration.json") as content:
+        del content["uncertainty"]
     with pytest.raises(InputError, match=r"no key 'uncertainty'.*run limbfit run again"):
         build_report(copy, copy / "report")
 
 
 def test_a_failed_simulation_is_named(copy: Path) -> None:
-    file = copy / "predict" / "predict.json"
-    content = json.loads(file.read_text())
-    content["sites"][3] |= {
-        "completed": False,
-        "reason": "the step fell below its limit",
-        "error_percent": None,
-    }
-    file.write_text(json.dumps(content))
+    with rewritten(copy / "predict" / "predict.json") as content:
+        content["sites"][3] |= {
+            "completed": False,
+            "reason": "the step fell below its limit",
+            "error_percent": None,
+        }
     text = render_sections(copy, make_solver_section)
     assert "did not reach the end of the record at: PO-6" in text
     assert "no: the step fell below its limit" in text
 
 
 def test_what_is_not_predicted_is_said_with_its_reason(copy: Path) -> None:
-    file = copy / "predict" / "predict.json"
-    content = json.loads(file.read_text())
-    row = content["sites"][3]
-    why = "in the search: went over its limits"
-    row |= {"error_one_material_percent": None, "not_predicted": {"interval": why, "one_material": why}}
-    row["warnings"] = [f"no force with one material: {why}"]
-    content |= {"flags": [], "failed": ["site PO-6, one material: lost"]}
-    file.write_text(json.dumps(content))
+    with rewritten(copy / "predict" / "predict.json") as content:
+        row = content["sites"][3]
+        why = "in the search: went over its limits"
+        row |= {"error_one_material_percent": None, "not_predicted": {"interval": why, "one_material": why}}
+        row["warnings"] = [f"no force with one material: {why}"]
+        content |= {"flags": [], "failed": ["site PO-6, one material: lost"]}
     curve = copy / "predict" / "PO-6.csv"
     rows = [",".join(line.split(",")[:3]) for line in curve.read_text().splitlines()]
     curve.write_text("\n".join(rows))  # no simulated force either
@@ -175,19 +170,15 @@ def test_what_is_not_predicted_is_said_with_its_reason(copy: Path) -> None:
 
 def double_a_site(copy: Path, site: str) -> None:
     """Its record twice, in predictions and traces; the second is off by much more."""
-    file = copy / "predict" / "predict.json"
-    content = json.loads(file.read_text())
-    at = next(i for i, row in enumerate(content["sites"]) if row["site"] == site)
-    row = content["sites"][at]
-    twins = [row | {"record": f"{site}-slow"}, row | {"record": f"{site}-fast"}]
-    twins[1] |= {"error_percent": 30.0, "error_one_material_percent": 60.0}
-    content["sites"][at : at + 1] = twins
-    file.write_text(json.dumps(content))
-    file = copy / "traces" / "traces.json"
-    content = json.loads(file.read_text())
-    facts = content["sites"].pop(site)
-    content["sites"] |= {f"{site}-slow": facts, f"{site}-fast": facts}
-    file.write_text(json.dumps(content))
+    with rewritten(copy / "predict" / "predict.json") as content:
+        at = next(i for i, row in enumerate(content["sites"]) if row["site"] == site)
+        row = content["sites"][at]
+        twins = [row | {"record": f"{site}-slow"}, row | {"record": f"{site}-fast"}]
+        twins[1] |= {"error_percent": 30.0, "error_one_material_percent": 60.0}
+        content["sites"][at : at + 1] = twins
+    with rewritten(copy / "traces" / "traces.json") as content:
+        facts = content["sites"].pop(site)
+        content["sites"] |= {f"{site}-slow": facts, f"{site}-fast": facts}
 
 
 def test_the_summary_and_the_table_count_the_records_of_a_site_as_that_site(copy: Path) -> None:
@@ -241,10 +232,8 @@ def describe_sites(results: Path) -> str:
 
 
 def test_records_under_a_stated_force_have_errors_of_displacement(copy: Path) -> None:
-    file = copy / "predict" / "predict.json"
-    content = json.loads(file.read_text())
-    content["sites"] = [row | {"control": "force"} for row in content["sites"]]
-    file.write_text(json.dumps(content))
+    with rewritten(copy / "predict" / "predict.json") as content:
+        content["sites"] = [row | {"control": "force"} for row in content["sites"]]
     text = render_sections(copy, make_prediction_section, make_method_section)
     assert "the model predicts the displacement with a mean error of" in text
     assert "mean displacement error at the held-out sites" in text
@@ -265,11 +254,8 @@ def test_indentations_without_records(copy: Path) -> None:
         "penetration_mm": 0.02,
         "completed": True,
     }
-    folder = copy / "simulate"
-    folder.mkdir()
-    stored = complete(SimulateResult, facts | {"parameters_from": "start of the study"})
-    (folder / "TI-2.json").write_text(json.dumps(stored))
-    (folder / "TI-2.csv").write_text("time_s,displacement_mm,force_N\n0,0,0\n6.25,6,7.126\n")
+    write_result(copy, SimulateResult, facts | {"parameters_from": "start of the study"}, "TI-2")
+    (copy / "simulate" / "TI-2.csv").write_text("time_s,displacement_mm,force_N\n0,0,0\n6.25,6,7.126\n")
     text = render_sections(copy, make_simulated_section)
     section = section_of(text, "simulated")
     assert ">7.13<" in section
@@ -300,7 +286,7 @@ def test_experiments_are_shown_unless_stale(copy, tmp_path):
     compress_cube(copy / "cube", parameters={"skin": SKIN, "muscle": SKIN})
     run = json.loads((copy / "run.json").read_text())
     states = {"cube": {"state": "done", "options": {}}, "regions": {"state": "stale"}}
-    (copy / "run.json").write_text(json.dumps(complete(RunResult, run | {"experiments": states})))
+    write_result(copy, RunResult, run | {"experiments": states})
     page = build_report(copy, tmp_path / "out").read_text(encoding="utf-8")
     assert '<section id="cube"' in page
     assert "pig skin, along the spine" in page
@@ -310,31 +296,24 @@ def test_experiments_are_shown_unless_stale(copy, tmp_path):
 
 def test_other_models_are_left_out_once_the_study_was_identified_anew(copy):
     """They have no stamp of their own."""
-    calibration = json.loads((copy / "calibrate" / "calibration.json").read_text())
-    models = {"models": [{"model": "the study's own", "parameters": calibration["stages"][-1]["parameters"]}]}
-    (copy / "models").mkdir()
-    (copy / "models" / "models.json").write_text(json.dumps(complete(ModelsResult, models)))
-    assert load_store(copy).models is not None
-    calibration["stages"][-1]["parameters"]["skin"]["c_kPa"] *= 1.001
-    (copy / "calibrate" / "calibration.json").write_text(json.dumps(calibration))
+    with rewritten(copy / "calibrate" / "calibration.json") as calibration:
+        identified = calibration["stages"][-1]["parameters"]
+        write_result(copy, ModelsResult, {"models": [{"model": "the study's own", "parameters": identified}]})
+        assert load_store(copy).models is not None
+        identified["skin"]["c_kPa"] *= 1.001
     store = load_store(copy)
     assert (store.models, store.outdated) == (None, ("uncertainty --models",))
 
 
 def test_simulations_with_identified_parameters_are_left_out_once_others_are_identified(copy):
-    calibration = json.loads((copy / "calibrate" / "calibration.json").read_text())
-    identified = calibration["stages"][-1]["parameters"]
-    for model, verb, names in (
-        (SimulateResult, "simulate", ("PT-1", "TI-2")),
-        (CompareResult, "compare", ("PT-1",)),
-    ):
-        (copy / verb).mkdir()
-        for name, origin in zip(names, ("identified", "given"), strict=False):
-            row = complete(model, {"site": name, "parameters_from": origin, "parameters": identified})
-            (copy / verb / f"{name}.json").write_text(json.dumps(row))
-    assert [row.site for row in load_store(copy).simulated] == ["PT-1", "TI-2"]
-    identified["skin"]["c_kPa"] *= 1.001
-    (copy / "calibrate" / "calibration.json").write_text(json.dumps(calibration))
+    with rewritten(copy / "calibrate" / "calibration.json") as calibration:
+        identified = calibration["stages"][-1]["parameters"]
+        for model, names in ((SimulateResult, ("PT-1", "TI-2")), (CompareResult, ("PT-1",))):
+            for name, origin in zip(names, ("identified", "given"), strict=False):
+                row = {"site": name, "parameters_from": origin, "parameters": identified}
+                write_result(copy, model, row, name)
+        assert [row.site for row in load_store(copy).simulated] == ["PT-1", "TI-2"]
+        identified["skin"]["c_kPa"] *= 1.001
     store = load_store(copy)
     assert ([row.site for row in store.simulated], store.compared) == (["TI-2"], ())
     assert set(store.outdated) == {"simulate --site PT-1", "compare --site PT-1"}

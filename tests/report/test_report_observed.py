@@ -1,12 +1,12 @@
 """What was seen beside the force, in the report: a figure of each kind, a row of each thing seen."""
 
-import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 from stored_results import write_results
 
+from editing import rewritten
 from limbfit.report.drawing.figures import draw_seen_figures
 from limbfit.report.sections.identification import (
     make_fit_section,
@@ -58,11 +58,9 @@ WAVE = {
 def results(tmp_path: Path) -> Path:
     """A study with a surface at a fitted site, ultrasound and shear waves at a held-out one."""
     folder = write_results(tmp_path / "results", geometry=False)
-    file = folder / "predict" / "predict.json"
-    content = json.loads(file.read_text())
-    for row in content["sites"]:
-        row["observed"] = {"PT-1": [SURFACE], "TI-5": [LAYER, WAVE]}.get(row["site"], [])
-    file.write_text(json.dumps(content))
+    with rewritten(folder / "predict" / "predict.json") as content:
+        for row in content["sites"]:
+            row["observed"] = {"PT-1": [SURFACE], "TI-5": [LAYER, WAVE]}.get(row["site"], [])
     moves = np.linspace(-1.2, 0.4, 96)
     columns = {
         "time_s": np.linspace(0.5, 9.0, 96),

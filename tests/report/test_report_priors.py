@@ -7,7 +7,8 @@ from typing import Any
 import pytest
 from stored_results import NAMES, write_results
 
-from completing import complete
+from completing import write_result
+from editing import rewritten
 from limbfit.priors import SOURCE
 from limbfit.report.page import Prose, Table
 from limbfit.report.sections.identification import make_parameter_section
@@ -21,17 +22,15 @@ def results(tmp_path: Path) -> Path:
 
 
 def add_priors(results: Path) -> None:
-    file = results / "calibrate" / "calibration.json"
-    content = json.loads(file.read_text())
-    content["uncertainty"]["priors"] = {
-        "stated": {
-            "skin.c_kPa": {"median": 7.37, "factor": 2.18, "source": SOURCE},
-            "muscle.m": {"median": 3.0, "factor": 1.25, "source": "the study"},
-        },
-        "share": {name: 0.625 if name == "skin.c_kPa" else 0.031 for name in NAMES},
-        "wider_without": {name: 1.84 if name == "skin.c_kPa" else 1.02 for name in NAMES},
-    }
-    file.write_text(json.dumps(content))
+    with rewritten(results / "calibrate" / "calibration.json") as content:
+        content["uncertainty"]["priors"] = {
+            "stated": {
+                "skin.c_kPa": {"median": 7.37, "factor": 2.18, "source": SOURCE},
+                "muscle.m": {"median": 3.0, "factor": 1.25, "source": "the study"},
+            },
+            "share": {name: 0.625 if name == "skin.c_kPa" else 0.031 for name in NAMES},
+            "wider_without": {name: 1.84 if name == "skin.c_kPa" else 1.02 for name in NAMES},
+        }
 
 
 def find_table(results: Path, name: str) -> tuple[Any, Any]:
@@ -71,8 +70,7 @@ def test_the_section_of_parameters_has_the_table_where_there_are_priors(results:
 
 def test_moduli_at_several_times_are_shown_with_what_the_records_prefer(results: Path) -> None:
     assert find_table(results, "moduli") == (None, None)
-    file = results / "calibrate" / "calibration.json"
-    content = json.loads(file.read_text())
+    content = json.loads((results / "calibrate" / "calibration.json").read_text())
     content["uncertainty"]["relaxation"] = {
         "words": ["the records cannot tell the relaxation of the model from a power law of time"],
         "moduli": [
@@ -82,7 +80,7 @@ def test_moduli_at_several_times_are_shown_with_what_the_records_prefer(results:
         "prior": {"slope": [0.0, 0.3], "source": "published tissue"},
         "beyond": {"longest_s": 12.6},
     }
-    file.write_text(json.dumps(complete(CalibrationResult, content)))
+    write_result(results, CalibrationResult, content)
     words, table = find_table(results, "moduli")
     assert words.text.startswith("The records cannot tell")
     assert "after 13 s" in words.text

@@ -1,11 +1,9 @@
 """Results of one site made from formulas: fields of some steps, parameters, errors and curves."""
 
-import json
-
 import numpy as np
 import pyvista as pv
 
-from completing import complete
+from completing import write_result
 from limbfit.mesh import Mesh, to_tet10, write_pvd, write_vtu
 from limbfit.results.identification import CalibrationResult, PredictResult
 
@@ -35,8 +33,6 @@ def fields(mesh: Mesh, share: float) -> tuple[dict, dict]:
 
 def write_outcome(results, error: float = 3.0) -> None:
     """What calibration and prediction store, as far as the view shows it."""
-    for name in ("predict", "calibrate"):
-        (results / name).mkdir(parents=True, exist_ok=True)
     parameters = {
         tissue: {"c_kPa": error, "m": 4.0, "gamma": 1.0, "tau_s": 0.5} for tissue in ("skin", "muscle")
     }
@@ -44,9 +40,7 @@ def write_outcome(results, error: float = 3.0) -> None:
         {"name": name, "parameters": parameters, "iterations": [{}]}
         for name in ("one material", "two materials")
     ]
-    (results / "calibrate" / "calibration.json").write_text(
-        json.dumps(complete(CalibrationResult, {"stages": stages}))
-    )
+    write_result(results, CalibrationResult, {"stages": stages})
     rows = [
         {
             "site": "1",
@@ -58,7 +52,7 @@ def write_outcome(results, error: float = 3.0) -> None:
         }
     ]
     content = {"sites": rows, "mean_error_fitted_percent": error, "mean_error_heldout_percent": None}
-    (results / "predict" / "predict.json").write_text(json.dumps(complete(PredictResult, content)))
+    write_result(results, PredictResult, content)
     (results / "predict" / "1.csv").write_text(
         f"time_s,displacement_mm,force_measured_N,force_simulated_N\n0,0,0,0\n1,5,6,{error}\n2,0,0,0\n"
     )

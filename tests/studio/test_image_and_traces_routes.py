@@ -11,6 +11,7 @@ import pytest
 from limb_image import make_segmented
 from serving_here import open_page
 
+from editing import edit
 from limbfit import run_study
 from limbfit.anatomy.imaging import read_labels
 from limbfit.pipeline.engine.store import lock
@@ -82,9 +83,7 @@ def test_the_studys_own_labels_stay_as_they_are(limb):
     given = limb / "given.seg.nrrd"
     shutil.copy(limb / "results" / "segment" / "labels.seg.nrrd", given)
     file = limb / "study.toml"
-    file.write_text(
-        file.read_text().replace("[image]", '[segmentation]\nlabels = "given.seg.nrrd"\n\n[image]')
-    )
+    edit(limb, "[image]", '[segmentation]\nlabels = "given.seg.nrrd"\n\n[image]')
     run_study(load_study(limb), until="segment")
     client, before = open_page(limb), given.read_bytes()
     base = client.get("/api/image").json()["labels"]["base"]

@@ -7,6 +7,7 @@ import pytest
 
 from acquiring import fitsocket, start
 from browsing import serious_findings, until
+from editing import append
 from limbfit.acquire import read_recording
 
 
@@ -30,8 +31,7 @@ def state(page) -> str | None:
 
 @pytest.mark.slow
 def test_curves_grow_outlast_a_reload_and_end_in_the_verdict(ready, serve, open_page):
-    file = ready / "study.toml"
-    file.write_text(file.read_text() + "precondition = 4\n")  # long enough for a browser on a busy machine
+    append(ready, "precondition = 4\n")  # long enough for a browser on a busy machine
     page = open_page(serve(ready) + "#/traces")
     page.get_by_role("heading", name="Site 1").wait_for()
     assert not page.locator("#live").is_visible()

@@ -9,7 +9,8 @@ import pytest
 import pyvista as pv
 from serving_here import open_page
 
-from completing import complete
+from completing import write_result
+from editing import edit
 from limbfit import load_study
 from limbfit.mesh import Mesh, boundary_faces, measure_quality, write_vtu
 from limbfit.results.limb import MeshResult
@@ -22,8 +23,7 @@ from unpacking import unpack
 @pytest.fixture
 def page(study):
     """The stump with comments in its file, as its page talks to it."""
-    file = study / "study.toml"
-    file.write_text(file.read_text().replace('name = "1"', 'name = "1"  # the first one\nregion = "lateral"'))
+    edit(study, 'name = "1"', 'name = "1"  # the first one\nregion = "lateral"')
     return open_page(study)
 
 
@@ -180,11 +180,8 @@ def _meshed(study) -> Mesh:
     cells[wrong] = cells[wrong][:, [0, 2, 1, 3]]
     layer = (points[cells][:, :, 2].mean(axis=1) < 6).astype(np.int64)
     mesh = Mesh(points, cells, "tet4", layer, ("skin", "muscle"))
-    folder = study / "results" / "mesh"
-    folder.mkdir(parents=True)
-    write_vtu(mesh, folder / "1.vtu")
-    stored = complete(MeshResult, {"sites": {"1": {"min_dihedral_deg": 54.7}}})
-    (folder / "mesh.json").write_text(json.dumps(stored))
+    write_result(study / "results", MeshResult, {"sites": {"1": {"min_dihedral_deg": 54.7}}})
+    write_vtu(mesh, study / "results" / "mesh" / "1.vtu")
     return mesh
 
 

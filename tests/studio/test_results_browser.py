@@ -9,6 +9,7 @@ import pyvista as pv
 
 from browsing import until
 from conftest import COARSE
+from editing import append
 from limbfit import load_study, run_study
 from limbfit.febio import read_feb, to_problem
 from limbfit.studio.results_routes import FIELDS
@@ -21,8 +22,7 @@ PLACES = {"1": (40.0, 0.0, 60.0), "2": (0.0, 40.0, 50.0)}  # of the stump's site
 def meshed(pristine, tmp_path_factory):
     """The stump with coarse meshes of both sites."""
     folder = shutil.copytree(pristine, tmp_path_factory.mktemp("meshed") / "study")
-    file = folder / "study.toml"
-    file.write_text(file.read_text() + COARSE)
+    append(folder, COARSE)
     run_study(load_study(folder), until="mesh")
     return folder
 

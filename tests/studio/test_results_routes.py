@@ -1,6 +1,5 @@
 """The view Results' server side: stored fields as they are stored, runs kept and compared, files to keep."""
 
-import json
 import time
 
 import numpy as np
@@ -8,7 +7,7 @@ import pytest
 from serving_here import open_page
 from stored_fields import block, fields, write_outcome, write_stored
 
-from completing import complete
+from completing import write_result
 from limbfit.results.runs import SimulateResult
 from limbfit.studio.folder import StudyFolder
 from limbfit.studio.processes import find_simulating
@@ -36,8 +35,7 @@ def test_what_can_be_played_is_told_with_its_times(page, study):
 
 def test_steps_of_parameters_that_were_identified_before_are_told_as_such(page, study):
     stored = {"site": "1", "parameters": {"skin": {"c_kPa": 9.0}}, "parameters_from": "identified"}
-    file = study / "results" / "simulate" / "1.json"
-    file.write_text(json.dumps(complete(SimulateResult, stored)))
+    write_result(study / "results", SimulateResult, stored, "1")
     played, _ = page.get("/api/results/site/1").json()["sources"]
     assert played["parameters_from"] == "identified, before the study was identified anew"
 

@@ -1,13 +1,12 @@
 """The view Socket in a real browser, over stored runs made from formulas."""
 
-import json
-
 import numpy as np
 import pytest
 from stored_fields import block
 
 from browsing import serious_findings, until
-from completing import complete
+from completing import write_result
+from editing import append
 from limbfit import load_study
 from limbfit.mesh import write_vtu
 from limbfit.results.runs import StageStamp
@@ -31,8 +30,8 @@ def write_run(results, folder: str, begin: str, factor: float) -> dict:
 
 
 def write_designs(results, designs: list[dict]) -> None:
-    content = complete(SocketDesignResult, {"designs": designs})
-    (results / "socket_design" / "socket_design.json").write_text(json.dumps(content))
+    write_result(results, SocketDesignResult, {"designs": designs})
+    write_result(results, StageStamp, {}, "socket_design")
 
 
 @pytest.mark.slow
@@ -41,11 +40,10 @@ def test_pressure_is_stepped_through_and_read_under_the_pointer(study, serve, op
     page.get_by_text("No run of the socket is stored yet.").wait_for()
     results = study / "results"
     content = write_run(results, "socket", "held", 5.0)
-    (results / "socket" / "socket.json").write_text(json.dumps(complete(SocketResult, content)))
+    write_result(results, SocketResult, content)
     design = {"name": "design", "simulation": write_run(results, "socket_design", "design", 2.0)}
     write_designs(results, [design])
-    for folder in ("socket", "socket_design"):
-        (results / folder / "stage.json").write_text(json.dumps(complete(StageStamp, {})))
+    write_result(results, StageStamp, {}, "socket")
     words, slider = page.locator(".view.socket .player-words"), page.get_by_label("step", exact=True)
     until(lambda: words.inner_text().startswith("donning; contact pressure at most 10.0 kPa"))
     bar = page.locator(".view.socket .lf-bar")
@@ -88,8 +86,8 @@ def test_cells_of_sensors_are_drawn_beside_the_limb_with_their_agreement(study, 
     content["sensors"] = [{"name": "sheet", "load": "stance", "counts": {}, "cells": cells}]
     row = {"load": "stance", "region": "all", "cells": 2, "measured_kPa": 30.0, "model_kPa": 32.0}
     content["agreement"] = [row | {"bias_kPa": 2.0, "limits_kPa": [-9.1, 13.1], "within_percent": 50.0}]
-    (results / "socket" / "socket.json").write_text(json.dumps(complete(SocketResult, content)))
-    (results / "socket" / "stage.json").write_text(json.dumps(complete(StageStamp, {})))
+    write_result(results, SocketResult, content)
+    write_result(results, StageStamp, {}, "socket")
     page = open_page(serve(study) + "#/socket")
     chosen, means = page.get_by_role("combobox", name="sensors"), page.locator(".socket-cells")
     chosen.select_option("measured_kPa")
@@ -122,7 +120,6 @@ def test_two_runs_stand_beside_each_other_on_one_scale_and_turn_together(study, 
         for name, factor in (("control", 5.0), ("design", 2.0))
     ]
     write_designs(results, designs)
-    (results / "socket_design" / "stage.json").write_text(json.dumps(complete(StageStamp, {})))
     page = open_page(serve(study) + "#/socket")
     words, canvas = page.locator(".view.socket .player-words"), page.locator(".view.socket .lf-canvas")
     until(lambda: words.inner_text().startswith("donning"))
@@ -144,7 +141,7 @@ def test_two_runs_stand_beside_each_other_on_one_scale_and_turn_together(study, 
 @pytest.mark.slow
 def test_areas_are_placed_by_a_click_written_and_drawn_and_a_run_says_what_is_wrong(study, serve, open_page):
     file = study / "study.toml"
-    file.write_text(file.read_text() + "[socket]\ntrim_mm = 40.0  # of the brim\n")
+    append(study, "[socket]\ntrim_mm = 40.0  # of the brim\n")
     page = open_page(serve(study) + "#/socket")
     page.get_by_role("combobox", name="view").select_option("its shape")
     words, canvas = page.locator(".socket-shape-words"), page.locator(".view.socket .lf-canvas")
@@ -179,7 +176,7 @@ def test_areas_are_placed_by_a_click_written_and_drawn_and_a_run_says_what_is_wr
 def test_the_trimline_is_dragged_written_and_drawn(study, serve, open_page):
     """A handle of the brim, with the mouse and with a key; a drag too far down springs back."""
     file = study / "study.toml"
-    file.write_text(file.read_text() + "[socket]\ntrim_mm = 40.0\n")
+    append(study, "[socket]\ntrim_mm = 40.0\n")
     page = open_page(serve(study) + "#/socket", may_say="status of 422")
     page.get_by_role("combobox", name="view").select_option("its shape")
     words, canvas = page.locator(".socket-shape-words"), page.locator(".view.socket .lf-canvas")

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from serving_here import open_page
 
+from editing import append, edit
 from limbfit import load_study
 from unpacking import unpack
 
@@ -13,8 +14,7 @@ AREA = {"name": "front", "position": [0.0, -41.0, 60.0], "radius_mm": 25.0, "dep
 @pytest.fixture
 def page(study):
     """The stump with a socket and a comment in its file, as its page talks to it."""
-    file = study / "study.toml"
-    file.write_text(file.read_text() + "[socket]\ntrim_mm = 34.0  # of the brim\n")
+    append(study, "[socket]\ntrim_mm = 34.0  # of the brim\n")
     return open_page(study)
 
 
@@ -53,9 +53,8 @@ def test_what_cannot_be_drawn_is_said_and_what_the_study_refuses_changes_nothing
 
 
 def test_a_list_of_areas_in_one_line_is_added_to(page, study):
-    file = study / "study.toml"
     one = '{ name = "a", region = "tibial crest", radius_mm = 20.0, depth_mm = 1.0 }'
-    file.write_text(file.read_text() + f"areas = [{one}]\n")
+    append(study, f"areas = [{one}]\n")
     assert page.post("/api/socket/areas", json=AREA).status_code == 200
     assert [area.name for area in load_study(study).socket.areas] == ["a", "front"]
 
@@ -113,6 +112,5 @@ def test_a_brim_that_leaves_no_socket_is_refused_and_changes_nothing(page, study
 
 def test_a_socket_from_a_file_has_no_brim_to_drag(page, study):
     (study / "own.stl").write_text("solid\nendsolid\n")
-    file = study / "study.toml"
-    file.write_text(file.read_text().replace("trim_mm = 34.0", 'file = "own.stl"'))
+    edit(study, "trim_mm = 34.0", 'file = "own.stl"')
     assert page.get("/api/socket/shape").json()["trim"]["points"] == []

@@ -11,6 +11,7 @@ from limb_image import make_segmented
 from serving_here import serve_here as serve_here
 
 from browsing import serious_findings, until
+from editing import append
 from limbfit import run_study
 from limbfit.anatomy.imaging import read_labels
 from limbfit.study import load_study
@@ -98,8 +99,7 @@ def test_a_painted_stroke_is_saved_and_stages_turn_stale(tmp_path, serve, open_p
 def test_a_calibration_is_started_watched_reloaded_stopped_and_resumed(
     study, coarse_settings, serve, open_page
 ):
-    file = study / "study.toml"
-    file.write_text(file.read_text() + coarse_settings.replace("max_iterations = 2", "max_iterations = 12"))
+    append(study, coarse_settings.replace("max_iterations = 2", "max_iterations = 12"))
     run_study(load_study(study), until="mesh")
     page = open_page(serve(study) + "#/identification")
     iterates = re.compile(r"(\d+) iterates")
@@ -140,9 +140,8 @@ def _token(page) -> str:
 
 @pytest.mark.slow
 def test_a_run_outlives_its_server(study, coarse_settings, serve, open_page):
-    file = study / "study.toml"
     longer = coarse_settings.replace("edge_near_mm = 8.0", "edge_near_mm = 4.0")  # than a server starts
-    file.write_text(file.read_text() + longer)
+    append(study, longer)
     page = open_page(serve(study) + "#/identification")
     page.locator("#run-start").click()
     until(
@@ -199,8 +198,7 @@ def test_the_page_is_worked_by_keyboard(study, serve, open_page):
 @pytest.mark.slow
 def test_memory_of_server_and_page_stays_level(study, coarse_settings, serve, open_page):
     """A study that writes a log line all the time, watched for three minutes, with views opened in turn."""
-    file = study / "study.toml"
-    file.write_text(file.read_text() + coarse_settings)
+    append(study, coarse_settings)
     run_study(load_study(study), until="traces")
     page = open_page(serve(study) + "#/identification")
     server = next(p for p in psutil.Process().children() if "studio" in p.cmdline())

@@ -1,7 +1,5 @@
 """The views Model and Results in a real browser."""
 
-import json
-
 import numpy as np
 import pytest
 import pyvista as pv
@@ -9,6 +7,7 @@ from serving_here import serve_here as serve_here
 from stored_fields import write_outcome, write_stored
 
 from browsing import WITHOUT_WEBGL, serious_findings, until
+from editing import append, edit, rewritten
 from limbfit import load_study
 
 # Where the camera looks from each side, by the key that shows it (LPS).
@@ -78,8 +77,7 @@ def test_a_hidden_view_reads_nothing_until_it_is_shown(study, serve, open_page):
     page.on("request", lambda request: asked.append(request.url))
     page.evaluate("location.hash = '#/traces'")
     page.locator("#trace-facts dd").first.wait_for()
-    file = study / "study.toml"
-    file.write_text(file.read_text().replace('name = "2"', 'name = "calf"'))
+    edit(study, 'name = "2"', 'name = "calf"')
     page.locator(".view.traces .side").get_by_text("calf").wait_for()  # what is seen has followed
     assert not [url for url in asked if "/api/model" in url]
     page.evaluate("location.hash = '#/model'")
@@ -132,19 +130,16 @@ def test_without_webgl_the_views_say_so_and_the_rest_works(study, serve, open_pa
 def test_the_answer_of_another_law_is_shown_as_it_was(study, serve, open_page):
     """Until the study is identified anew; the buttons that do so stay, too."""
     write_outcome(study / "results")
-    stored = study / "results" / "calibrate" / "calibration.json"
-    content = json.loads(stored.read_text())
-    found = content["stages"][-1]["parameters"]
-    for stage in content["stages"]:
-        stage["iterations"][0] |= {"parameters": found, "error_percent": 3.0}
-    content["uncertainty"]["intervals_95"] = {
-        tissue: {key: [value / 2.0, value * 2.0] for key, value in values.items()}
-        for tissue, values in found.items()
-    }
-    stored.write_text(json.dumps(content))
+    with rewritten(study / "results" / "calibrate" / "calibration.json") as content:
+        found = content["stages"][-1]["parameters"]
+        for stage in content["stages"]:
+            stage["iterations"][0] |= {"parameters": found, "error_percent": 3.0}
+        content["uncertainty"]["intervals_95"] = {
+            tissue: {key: [value / 2.0, value * 2.0] for key, value in values.items()}
+            for tissue, values in found.items()
+        }
     layers = '{ name = "skin", thickness_mm = 1.5 }, { name = "fat", thickness_mm = 3.0 }'
-    file = study / "study.toml"
-    file.write_text(file.read_text() + f'[material]\nlaw = "fung"\n[geometry]\nlayers = [{layers}]\n')
+    append(study, f'[material]\nlaw = "fung"\n[geometry]\nlayers = [{layers}]\n')
     page = open_page(serve(study) + "#/identification")
     answer = page.locator("#answer")
     answer.get_by_text("the last calibration that was completed").wait_for()

@@ -1,6 +1,5 @@
 """Wrong records are told by ``limbfit check`` and shown in the report."""
 
-import json
 import sys
 from pathlib import Path
 
@@ -11,7 +10,7 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parents[2] / "anatomy"))
 from limbs import leg_image
 
-from completing import complete
+from completing import write_result
 from conftest import write_trace
 from limbfit import check_study, load_study, run_study
 from limbfit.anatomy.imaging import write_labels, write_volume
@@ -119,9 +118,7 @@ def test_an_image_that_says_twice_where_it_lies_is_told_by_check_stage_and_repor
 
 def section(tmp_path, **predict):
     """The section of a folder that holds predictions alone."""
-    content = complete(PredictResult, {"sites": [], **predict})
-    (tmp_path / "predict").mkdir(exist_ok=True)
-    (tmp_path / "predict" / "predict.json").write_text(json.dumps(content))
+    write_result(tmp_path, PredictResult, {"sites": [], **predict})
     return make_record_check_section(load_store(tmp_path))
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from conftest import COARSE
-from editing import append, edit
+from editing import append, edit, rewritten
 from limbfit import reproduce_study, run_study
 from limbfit.anatomy.grid import Volume
 from limbfit.anatomy.imaging import read_volume, write_volume
@@ -81,9 +81,8 @@ def test_a_study_comes_out_the_same_and_a_changed_one_is_refused(study, tmp_path
     append(study, COARSE)
     run_study(load_study(study))
     record = study / "results/run.json"
-    known = json.loads(record.read_text())
-    known["versions"]["numpy"] = "1.0"
-    record.write_text(json.dumps(known))
+    with rewritten(record) as known:
+        known["versions"]["numpy"] = "1.0"
     found = reproduce_study(record, tmp_path / "again")
     assert found["same"]
     assert max(found["parameters"].values()) == max(found["forces"].values()) == 0.0

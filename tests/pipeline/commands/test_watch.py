@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from editing import append
 from limbfit import InputError, load_study, watch_records
 
 HEAD = "time_s,displacement_mm,force_N"
@@ -62,8 +63,7 @@ def test_a_study_names_columns_sites_and_what_is_no_record(study: Path) -> None:
     assert found == {"1.csv": "1", "2.csv": "2"}
     renamed = study / "1.csv"
     renamed.write_text(renamed.read_text().replace("force_N", "load cell (N)"))
-    toml = study / "study.toml"
-    toml.write_text(toml.read_text() + '[traces]\nforce_N = "load cell (N)"\n')
+    append(study, '[traces]\nforce_N = "load cell (N)"\n')
     found = {
         one.record: one.verdict for one in watch_records(study, load_study(study, recorded=False), once=True)
     }
