@@ -106,6 +106,7 @@ def test_check_finds_what_cannot_be_computed_with() -> None:
 
 
 def test_numbers_of_one_name_are_one_tissue() -> None:
+    """As two they had the parameters of one name, and a fit took the derivatives of the first alone."""
     names = {1: "muscle", 2: "fat", 4: "muscle"}
     mesh = Mesh.from_arrays(cube().points, KUHN, [4, 2, 1, 1, 3, 2], names)
     assert mesh.region_names == ("muscle", "fat", "region 3")

@@ -116,15 +116,6 @@ def test_what_is_no_mesh_is_refused_with_a_remedy(make, text):
         make()
 
 
-def test_numbers_of_one_name_are_one_tissue():
-    """As two they had the parameters of one name, and a fit took the derivatives of the first alone."""
-    mesh = Mesh.from_pyvista(block(), "tissue")
-    halves = np.where(mesh.regions == 1, 5, np.where(np.arange(len(mesh.cells)) % 2, 2, 9))
-    found = Mesh.from_arrays(mesh.points, mesh.cells, halves, {2: "muscle", 9: "muscle", 5: "skin"})
-    assert found.region_names == ("muscle", "skin")
-    assert (found.regions == mesh.regions).all()
-
-
 def test_tissues_may_be_a_column_of_objects():
     names = np.array(["skin", "muscle"], dtype=object)[np.arange(48) % 2]
     mesh = Mesh.from_pyvista(block())

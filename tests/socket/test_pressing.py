@@ -1,5 +1,7 @@
 """A limb under pressure: a ball of tissue around a rigid one in closed form; the surface that comes of it."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import pyvista as pv
@@ -26,17 +28,11 @@ def ball() -> Mesh:
         cells += [np.column_stack([a, b[:, 2]]), np.column_stack([a[:, :2], b[:, 1:]])]
         cells += [np.column_stack([a[:, :1], b])]
     tets = np.vstack(cells)
-    flipped = np.linalg.det(points[tets[:, 1:]] - points[tets[:, :1]]) < 0
-    tets[flipped] = tets[flipped][:, [1, 0, 2, 3]]
-    mesh = Mesh(points, tets, "tet4", np.zeros(len(tets), dtype=np.int64), ("muscle",), {}, {})
+    mesh = Mesh.from_arrays(points, tets, np.full(len(tets), "muscle"))
     boundary = boundary_faces(mesh)
     outside = np.linalg.norm(points[boundary], axis=2).min(axis=1) > 0.5 * (INNER + OUTER)
     held = np.unique(boundary[~outside])
-    mesh = to_tet10(
-        Mesh(
-            points, tets, "tet4", mesh.regions, ("muscle",), {"fixed_bone": held}, {"skin": boundary[outside]}
-        )
-    )
+    mesh = to_tet10(replace(mesh, node_sets={"fixed_bone": held}, face_sets={"skin": boundary[outside]}))
     # Mid-edge nodes between nodes of one sphere go onto it.
     radius, moved = np.linalg.norm(mesh.points, axis=1), mesh.points.copy()
     ends = np.linalg.norm(mesh.points[mesh.cells[:, :4]], axis=2)

@@ -12,13 +12,9 @@ BESIDE_SITE_1 = np.array([28.0, -4.5, 55.0])
 
 
 def block() -> Mesh:
-    grid = pv.ImageData(dimensions=(4, 4, 4), spacing=(3, 3, 3)).to_tetrahedra(5)
-    cells = np.asarray(grid.cells).reshape(-1, 5)[:, 1:].astype(np.int64)
-    points = np.asarray(grid.points, dtype=float) + BESIDE_SITE_1
-    sides = points[cells][:, 1:] - points[cells][:, :1]
-    wrong = np.linalg.det(sides) < 0
-    cells[wrong] = cells[wrong][:, [0, 2, 1, 3]]
-    return to_tet10(Mesh(points, cells, "tet4", np.zeros(len(cells), np.int64), ("muscle",)))
+    grid = pv.ImageData(dimensions=(4, 4, 4), spacing=(3, 3, 3), origin=BESIDE_SITE_1).to_tetrahedra(5)
+    grid.cell_data["tissue"] = np.full(grid.n_cells, "muscle")
+    return to_tet10(Mesh.from_pyvista(grid, "tissue"))
 
 
 def fields(mesh: Mesh, share: float) -> tuple[dict, dict]:

@@ -172,14 +172,8 @@ def test_a_site_with_a_place_from_markups_stays_where_it_is(page, study):
 def _meshed(study) -> Mesh:
     """A block of tetrahedra as the mesh of site 1."""
     grid = pv.ImageData(dimensions=(4, 4, 4), spacing=(3, 3, 3)).to_tetrahedra(5)
-    cells = np.asarray(grid.cells).reshape(-1, 5)[:, 1:].astype(np.int64)
-    points = np.asarray(grid.points, dtype=float)
-    corners = points[cells]
-    sides = corners[:, 1:] - corners[:, :1]
-    wrong = np.linalg.det(sides) < 0
-    cells[wrong] = cells[wrong][:, [0, 2, 1, 3]]
-    layer = (points[cells][:, :, 2].mean(axis=1) < 6).astype(np.int64)
-    mesh = Mesh(points, cells, "tet4", layer, ("skin", "muscle"))
+    layer = grid.cell_centers().points[:, 2] < 6
+    mesh = Mesh.from_arrays(grid.points, grid.cells_dict[10], layer.astype(int), {0: "skin", 1: "muscle"})
     write_result(study / "results", MeshResult, {"sites": {"1": {"min_dihedral_deg": 54.7}}})
     write_vtu(mesh, study / "results" / "mesh" / "1.vtu")
     return mesh

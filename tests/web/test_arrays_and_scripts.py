@@ -23,17 +23,8 @@ from unpacking import unpack
 def _block(n: int = 3) -> Mesh:
     """A cube of n^3 cells, each of six tetrahedra; what lies below z = 1/3 is the second region."""
     grid = pv.ImageData(dimensions=(n + 1,) * 3, spacing=(1 / n,) * 3).to_tetrahedra(6)
-    cells = np.asarray(grid.cells).reshape(-1, 5)[:, 1:].astype(np.int64)
-    points = np.asarray(grid.points, dtype=float)
-    corners = points[cells]
-    volumes = np.einsum(
-        "mi,mi->m",
-        np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]),
-        corners[:, 3] - corners[:, 0],
-    )
-    cells[volumes < 0] = cells[volumes < 0][:, [0, 2, 1, 3]]
-    low = (points[cells][:, :, 2].mean(axis=1) < 1 / 3).astype(np.int64)
-    return Mesh(points, cells, "tet4", low, ("top", "bottom"))
+    low = grid.cell_centers().points[:, 2] < 1 / 3
+    return Mesh.from_arrays(grid.points, grid.cells_dict[10], low.astype(int), {0: "top", 1: "bottom"})
 
 
 def test_arrays_come_back_and_stand_aligned():
