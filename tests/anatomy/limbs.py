@@ -10,6 +10,7 @@ from limbfit.anatomy.imaging import LabelMap, Volume
 
 SHARED = Path(__file__).parents[2] / ".." / "shared"
 CALF = SHARED / "data" / "calf-mri"
+OPENLIMB = SHARED / "reference" / "openlimb-study"
 
 IDENTITY = {
     "PatientName": "DOE^JANESECRET",
@@ -105,6 +106,11 @@ def grid(shape: tuple[int, int, int], spacing: list[float], direction: np.ndarra
     return LabelMap(
         np.zeros(shape, np.uint8), spacing, np.array([-70.0, 30.0, -350.0]) - direction @ half, direction
     )
+
+
+def dice(a: np.ndarray, b: np.ndarray) -> float:
+    """Agreement of two masks: 1 where they are the same, 0 where they share nothing."""
+    return 2 * float((a & b).sum()) / float(a.sum() + b.sum())
 
 
 class Leg:

@@ -105,13 +105,12 @@ def test_ras_is_turned_to_lps(tmp_path):
 
 def moved(labels: LabelMap, how: str) -> LabelMap:
     if how == "shifted by half a voxel":
-        origin = labels.index_to_point([0.5, 0, 0])
-        return LabelMap(labels.array, labels.spacing, origin, labels.direction)
+        return replace(labels, origin=labels.index_to_point([0.5, 0, 0]))
     if how == "of another spacing":
-        return LabelMap(labels.array, labels.spacing * 1.05, labels.origin, labels.direction)
+        return replace(labels, spacing=labels.spacing * 1.05)
     if how == "turned":
-        return LabelMap(labels.array, labels.spacing, labels.origin, DIRECTIONS["oblique"])
-    return LabelMap(np.pad(labels.array, 2), labels.spacing, labels.origin, labels.direction)
+        return replace(labels, direction=DIRECTIONS["oblique"])
+    return replace(labels, array=np.pad(labels.array, 2))
 
 
 @pytest.mark.parametrize("how", ["shifted by half a voxel", "of another spacing", "turned", "larger"])

@@ -9,7 +9,7 @@ import igl
 import numpy as np
 import pytest
 from bodies import limb
-from limbs import SHARED, rotation
+from limbs import OPENLIMB, rotation
 
 from limbfit.anatomy.meshing import engines
 from limbfit.anatomy.meshing.extrusion import build_columns
@@ -22,7 +22,6 @@ from limbfit.errors import MeshingError, SurfaceError
 from limbfit.mesh import Mesh, boundary_faces, measure_quality, to_tet10
 from limbfit.mesh.cells import quadratic_simplex
 
-OPENLIMB = SHARED / "reference" / "openlimb-study"
 COARSE = MeshSettings(edge_near_mm=6.0, edge_far_mm=17.0, near_radius_mm=10.0, growth=0.7)
 
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import SimpleITK as sitk  # noqa: N813
-from limbs import write_dicom
+from limbs import dice, write_dicom
 
 from limbfit.anatomy.grid import BONES, FAT, Volume
 from limbfit.anatomy.imaging import read_volume
@@ -25,10 +25,6 @@ from limbfit.phantom.mri import CONTRASTS, make_grid
 from scanned import build_image
 
 SEED = 2
-
-
-def dice(a: np.ndarray, b: np.ndarray) -> float:
-    return 2 * float((a & b).sum()) / float(a.sum() + b.sum())
 
 
 @pytest.fixture(scope="module")

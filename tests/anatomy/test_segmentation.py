@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from limbs import CALF, DIRECTIONS, leg_image
+from limbs import CALF, DIRECTIONS, dice, leg_image
 from scipy.ndimage import label
 
 from limbfit.anatomy.grid import BONES
@@ -15,10 +15,6 @@ from limbfit.phantom.geometry import make_limb
 from limbfit.phantom.mri import generate_slabs, make_grid
 
 SHAPE, SPACING = (62, 60, 60), [2.0, 2.0, 2.5]
-
-
-def dice(a: np.ndarray, b: np.ndarray) -> float:
-    return 2 * float((a & b).sum()) / float(a.sum() + b.sum())
 
 
 @pytest.mark.slow

@@ -23,20 +23,17 @@ from limbfit.anatomy.surfaces.surfaces import (
     save_anatomy,
     write_surface,
 )
+from limbfit.anatomy.surfaces.triangles import from_pyvista
 from limbfit.errors import LabelError, SurfaceError
 
 
 def ball(radius: float = 50.0, centre=(10.0, -20.0, 30.0)) -> Surface:
     """A closed sphere, outward."""
-    sphere = pv.Icosphere(radius=radius, center=centre, nsub=3)
-    surface = Surface(np.asarray(sphere.points), sphere.regular_faces)
-    return surface if surface.volume > 0 else surface.flipped_surface
+    return from_pyvista(pv.Icosphere(radius=radius, center=centre, nsub=3)).outward_surface
 
 
 def test_measures_of_a_box():
-    box = pv.Box((0, 100, 0, 50, 0, 20)).triangulate()
-    surface = Surface(np.asarray(box.points), box.regular_faces)
-    surface = surface if surface.volume > 0 else surface.flipped_surface
+    surface = from_pyvista(pv.Box((0, 100, 0, 50, 0, 20)).triangulate()).outward_surface
     assert surface.volume == pytest.approx(100 * 50 * 20)
     assert surface.area == pytest.approx(2 * (5000 + 2000 + 1000))
     away = surface.points + np.array([1e4, -1e4, 1e4])

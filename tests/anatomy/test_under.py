@@ -6,12 +6,12 @@ import pyvista as pv
 
 from limbfit.anatomy.sites.sites import MAX_DEPTH_MM, measure_tissue_under
 from limbfit.anatomy.surfaces.surfaces import Anatomy, Surface
+from limbfit.anatomy.surfaces.triangles import from_pyvista
 
 
 def cylinder(radius: float, offset: float = 0.0) -> Surface:
     mesh = pv.Cylinder(center=(offset, 0, 0), direction=(0, 0, 1), radius=radius, height=200, resolution=200)
-    mesh = mesh.triangulate().clean()
-    return Surface(np.asarray(mesh.points, dtype=float), mesh.faces.reshape(-1, 4)[:, 1:].astype(np.int64))
+    return from_pyvista(mesh.triangulate().clean())
 
 
 @pytest.fixture(scope="module")

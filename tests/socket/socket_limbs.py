@@ -5,10 +5,11 @@ from pathlib import Path
 
 import numpy as np
 
+from limbfit.anatomy.surfaces.exchange import name_bodies
 from limbfit.anatomy.surfaces.files import read_surface
 from limbfit.anatomy.surfaces.mending import build_closed_anatomy
 from limbfit.anatomy.surfaces.surfaces import Anatomy
-from limbfit.anatomy.surfaces.triangles import Surface, find_bodies
+from limbfit.anatomy.surfaces.triangles import Surface, remove_unused_points
 from limbfit.socket.shape import cut_section
 
 SHARED = Path(__file__).parents[2] / ".." / "shared" / "data"
@@ -64,15 +65,11 @@ def round_limb() -> Anatomy:
 
 @cache
 def real_limb(name: str) -> Anatomy:
-    """A limb of OpenLimb: the body that is largest is the skin, the others its bones by place and size."""
-    parts = [part for part in find_bodies(read_surface(FILES[name])) if len(part.faces) > 100]
-    parts.sort(key=lambda part: -float(np.prod(np.ptp(part.points, axis=0))))
-    skin, *bones = parts
-    bones.sort(key=lambda part: float(part.points[:, 2].mean()))
-    low = sorted(bones[:2], key=lambda part: len(part.faces))
-    high = sorted(bones[2:], key=lambda part: len(part.faces))
-    named = {"fibula": low[0], "tibia": low[1], "patella": high[0], "femur": high[1]}
-    return build_closed_anatomy(skin, named, None, {})[0]
+    """A limb of OpenLimb, its bodies told apart by size and place."""
+    whole = read_surface(FILES[name])
+    named = name_bodies(whole, FILES[name])
+    bodies = {body: remove_unused_points(Surface(whole.points, faces)) for body, faces in named.items()}
+    return build_closed_anatomy(bodies.pop("skin"), bodies, None, {})[0]
 
 
 def measure_circumference(surface: Surface, point: np.ndarray, normal: np.ndarray) -> float:
