@@ -14,7 +14,7 @@ acquire adapt add advance amputate announce append apply approach approximate as
 average balance batch begin bench bisect build bump calibrate call cap change check choose clamp
 classify clean clear close coarsen code collect combine compare compile compress compute
 connect constrain continue convert convolve copy correct count couple create cross curve cut decode
-deform delay demo derive describe design diagnose die dilate divide do draw drop edit embed equilibrate
+deform delay demo derive describe design diagnose die dilate divide do draw drop edit equilibrate
 erode estimate evaluate expand explain explore export extend extract extrapolate extrude fail fill find
 finish fit flatten follow format from generate get grade group grow guess has hold ignore import impose
 improve insert interpolate interpret interrupt intersect invert is iterate join judge keep
@@ -108,7 +108,7 @@ ADJECTIVES = frozenset(
     suspect uncoupled upper upright vain whole
     """.split()  # noqa: SIM905
 )
-NOUNS_AND_VERBS = frozenset({"embed", "feed", "need", "ring", "speed", "spring", "string", "warning"})
+NOUNS_AND_VERBS = frozenset({"feed", "need", "ring", "speed", "spring", "string", "warning"})
 NOT_NOUNS = {
     "Coupling": "a noun of mechanics",
     "Finding": "a noun: what was found",

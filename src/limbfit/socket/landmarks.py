@@ -20,7 +20,7 @@ from ..anatomy.surfaces.surfaces import ON_CUT_MM, Anatomy
 from ..anatomy.surfaces.triangles import Surface
 from ..arrays import Array, Mask
 from ..errors import SurfaceError
-from .shape import cut_section, measure_section
+from .shape import measure_section
 
 PLATEAU_MM = 8.0  # of the tibia's top: its mean is the knee centre
 LEVELS = ("proximal", "middle", "distal")
@@ -120,7 +120,7 @@ def find_load_point(anatomy: Anatomy, brim: Array) -> Array:
     frame, skin = anatomy.frame, anatomy.skin
     z = min(float(frame.to_limb(brim)[:, 2].mean()), -1.0)  # below the cut, which closes the skin
     local = Surface(frame.to_limb(skin.points), skin.faces)
-    x, y, _ = measure_section(cut_section(local, (0.0, 0.0, z), (0.0, 0.0, 1.0)))
+    x, y, _ = measure_section(local, z)
     return frame.to_patient(np.array([x, y, z]))
 
 

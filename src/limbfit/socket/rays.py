@@ -20,7 +20,7 @@ from ..anatomy.grid import Frame, format_place
 from ..anatomy.surfaces.triangles import Surface, find_half_edges
 from ..arrays import Array, Indices
 from ..errors import SurfaceError
-from .shape import cut_section, measure_section
+from .shape import measure_section
 
 ANGLES = 180
 STEP_MM = 1.5  # between stations
@@ -150,7 +150,7 @@ def _build_rays(local: Surface) -> Rays:
             remedy="move the proximal cut up",
         )
     levels = np.linspace(bottom, -BELOW_CUT_MM, LEVELS + 2)[1:]
-    measured = np.array([measure_section(cut_section(local, (0.0, 0.0, z), (0.0, 0.0, 1.0))) for z in levels])
+    measured = np.array([measure_section(local, z) for z in levels])
     mean_radius = np.sqrt(measured[:, 2] / np.pi)
     # The end is as high as the limb is wide there; a long one keeps half of the limb for its shank.
     rounded = np.flatnonzero(levels - bottom >= np.minimum(mean_radius, 0.5 * (-bottom)))[0]

@@ -83,8 +83,9 @@ def cut_section(surface: Surface, point: ArrayLike, normal: ArrayLike) -> Array:
     return np.stack([np.where(turned, first, second), np.where(turned, second, first)], axis=1)
 
 
-def measure_section(segments: Array) -> Array:
-    """Centre (x, y) and area of what section segments (k, 2, 3) across z enclose."""
+def measure_section(surface: Surface, z: float) -> Array:
+    """Centre (x, y) and area of what a surface encloses at a height."""
+    segments = cut_section(surface, (0.0, 0.0, z), (0.0, 0.0, 1.0))
     a, b = segments[:, 0, :2], segments[:, 1, :2]
     twice = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
     area = twice.sum() / 2

@@ -115,13 +115,13 @@ def build_patient_frame(cut_normal: ArrayLike | None) -> NDArray[np.float64]:
     return np.array([np.cross(back, up), back, up])
 
 
-def read_shell(file: Path, max_faces: int | None = None) -> Shell:
+def read_shell(file: Path, max_faces: int) -> Shell:
     """A stored surface, of ``max_faces`` triangles at most; `ProblemError` where the file holds none."""
     surface: Any = pv.read(file)
     surface = surface.triangulate().clean()
     if surface.n_cells == 0:
         raise ProblemError("holds no triangles", file=file, remedy="make the surfaces again")
-    if max_faces is not None and surface.n_cells > max_faces:
+    if surface.n_cells > max_faces:
         surface = surface.decimate(1.0 - max_faces / surface.n_cells)
     return to_shell(surface)
 

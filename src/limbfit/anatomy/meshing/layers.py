@@ -28,7 +28,7 @@ from ...errors import SurfaceError
 from ...results.limb import BoneLoss, SkinLoss
 from ..grid import Frame
 from ..surfaces.surfaces import END_TOLERANCE_MM, Anatomy, check_cut, cut_and_cap
-from ..surfaces.thickness import SLOPE, limit_slope, transfer_values
+from ..surfaces.thickness import limit_slope, transfer_values
 from ..surfaces.triangles import Surface, cross_edges, find_bodies, find_open_edges, from_pyvista
 
 Level = tuple[Array, Array]  # a signed function at points and its gradient there
@@ -207,7 +207,7 @@ def _thin_layers(fields: LimbFields) -> LimbFields:
     depths = np.repeat(fields.depths, len(skin.points), axis=1) if fields.is_uniform else fields.depths
     whole = depths[-1]
     room = np.maximum(fields._bone(skin.points)[0] - fields.bone_clearance_mm, MIN_LAYER_SHARE * whole)
-    left = np.minimum(whole, limit_slope(skin, np.minimum(whole, room), SLOPE))
+    left = np.minimum(whole, limit_slope(skin, np.minimum(whole, room)))
     if (left == whole).all():
         return replace(fields, thinned=SkinLoss(volume_mm3=0.0, thinnest_mm=whole.min()))
     below = skin.points[:, 2] <= 0.0

@@ -181,7 +181,7 @@ def find_flat_ends(surface: Surface) -> list[tuple[Array, Array]]:
 def orient_outward(surface: Surface, name: str) -> tuple[Surface, tuple[str, ...]]:
     """Turn the faces outward if neighbours are oriented against each other; else change nothing."""
     alike = orient_faces(surface)
-    outward = alike if alike.volume > 0.0 else alike.flipped_surface
+    outward = alike.outward_surface
     count = count_turned(surface, outward)
     if alike is surface or count > MAX_TURNED_SHARE * len(surface.faces):
         return surface, ()

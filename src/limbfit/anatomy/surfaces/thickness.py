@@ -55,7 +55,7 @@ def measure_fat_depth(labels: LabelMap, anatomy: Anatomy, edge_mm: float = 3.0) 
     below = np.flatnonzero(~near_cut)
     lowered = skin.points[near_cut] - CUT_MM * anatomy.cut_normal
     depth[near_cut] = depth[below[KDTree(skin.points[below]).query(lowered)[1]]]
-    return limit_slope(skin, smooth_along_surface(skin, depth, SMOOTH_MM), SLOPE)
+    return limit_slope(skin, smooth_along_surface(skin, depth, SMOOTH_MM))
 
 
 def _measure_along_normals(skin: Surface, inner: Surface) -> Array:
@@ -80,10 +80,10 @@ def smooth_along_surface(surface: Surface, values: Array, length_mm: float) -> A
     return np.asarray(values)
 
 
-def limit_slope(surface: Surface, values: Array, slope: float) -> Array:
-    """Values (n,) at vertices lowered so that along no edge they change by more than ``slope`` per mm."""
+def limit_slope(surface: Surface, values: Array) -> Array:
+    """Values (n,) at vertices lowered so that along no edge they change by more than `SLOPE` per mm."""
     a, b = find_edges(surface).T
-    rise = slope * np.linalg.norm(surface.points[a] - surface.points[b], axis=1)
+    rise = SLOPE * np.linalg.norm(surface.points[a] - surface.points[b], axis=1)
     values = values.copy()
     while True:
         before = values.copy()
