@@ -5,6 +5,7 @@ import shutil
 import signal
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -142,21 +143,27 @@ def commands_unasked(monkeypatch) -> None:
     monkeypatch.setattr("limbfit.pipeline.commands.check.list_refused_commands", lambda *given: [])
 
 
+def call(monkeypatch, capture, *words: object) -> tuple[int, str, str]:
+    monkeypatch.setattr("sys.argv", ["limbfit", *map(str, words)])
+    try:
+        main()
+        code = 0
+    except SystemExit as end:
+        code = int(end.code or 0)
+    shown = capture.readouterr()
+    return code, shown.out, shown.err
+
+
 @pytest.fixture
 def limbfit(monkeypatch, capsys):
     """Run a command; returns (exit code, standard output, standard error)."""
+    return partial(call, monkeypatch, capsys)
 
-    def call(*words: object) -> tuple[int, str, str]:
-        monkeypatch.setattr("sys.argv", ["limbfit", *map(str, words)])
-        try:
-            main()
-            code = 0
-        except SystemExit as end:
-            code = int(end.code or 0)
-        shown = capsys.readouterr()
-        return code, shown.out, shown.err
 
-    return call
+@pytest.fixture
+def limbfit_and_libraries(monkeypatch, capfd):
+    """The same with what C libraries print."""
+    return partial(call, monkeypatch, capfd)
 
 
 @pytest.fixture(scope="session")

@@ -1,7 +1,5 @@
 """One case of each kind of damage ends in one clear line; all kinds, with the model, in the slow test."""
 
-import sys
-
 import damaging  # noqa: F401
 import numpy as np
 import pytest
@@ -10,7 +8,6 @@ from damaged_inputs import FORK, judge, make_whole, read_whole, run_case
 from limbs import leg_image, rotation, write_dicom
 
 from limbfit.anatomy.surfaces.surfaces import build_anatomy
-from limbfit.cli import main
 
 SEED = 1
 ROOMS = ("dicom", "file", "labels", "surfaces")
@@ -35,7 +32,7 @@ def refused_by_check(room: str) -> list[Kind]:
 
 
 @pytest.mark.parametrize("room", ROOMS)
-def test_damage_is_refused_in_one_line(leg, tmp_path, monkeypatch, capfd, room):
+def test_damage_is_refused_in_one_line(leg, tmp_path, limbfit_and_libraries, room):
     kinds = refused_by_check(room)
     assert len(kinds) > 5
     found = {}
@@ -44,11 +41,8 @@ def test_damage_is_refused_in_one_line(leg, tmp_path, monkeypatch, capfd, room):
         folder.mkdir()
         inputs = kind.make(np.random.default_rng([SEED, number]), leg, folder)
         (folder / "study.toml").write_text(leg.study(inputs))
-        monkeypatch.setattr(sys, "argv", ["limbfit", "check", str(folder)])
-        with pytest.raises(SystemExit) as end:
-            main()
-        shown = capfd.readouterr()
-        verdict, text, _ = judge(kind, int(end.value.code), shown.err + shown.out, folder, leg, "check")
+        code, out, err = limbfit_and_libraries("check", folder)
+        verdict, text, _ = judge(kind, code, err + out, folder, leg, "check")
         found[kind.name] = verdict if verdict == "refused" else f"{verdict}: {text}"
     assert set(found.values()) == {"refused"}, found
 

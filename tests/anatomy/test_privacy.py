@@ -14,7 +14,6 @@ from limbs import leg_image, rotation, write_dicom
 
 from conftest import COARSE
 from limbfit import load_study
-from limbfit.cli import main
 from limbfit.pipeline.commands.run import run_record
 from limbfit.pipeline.engine.store import write_result
 
@@ -90,18 +89,6 @@ def plant(file: Path) -> None:
     data.save_as(file)
 
 
-def call(words: list[str], monkeypatch, capfd) -> tuple[int, str]:
-    """Exit code and everything that was printed, by C libraries too."""
-    monkeypatch.setattr("sys.argv", ["limbfit", *words])
-    try:
-        main()
-        code = 0
-    except SystemExit as end:
-        code = int(end.code or 0)
-    shown = capfd.readouterr()
-    return code, shown.out + shown.err
-
-
 def contents(folder: Path) -> Iterator[tuple[str, bytes]]:
     """Every file below a folder as it is, and unpacked where something in it is packed."""
     for file in folder.rglob("*"):
@@ -141,16 +128,11 @@ def test_the_search_finds_what_is_planted(folder):
     assert found == set(TAG_SECRETS)
 
 
-def test_nothing_of_it_is_stored_or_said(folder, monkeypatch, capfd):
-    for words in (
-        ["series", str(folder)],
-        ["check", str(folder)],
-        ["run", str(folder), "--until", "sites"],
-        ["status", str(folder), "--json"],
-    ):
-        code, told = call(words, monkeypatch, capfd)
-        assert code == 0, told
-        assert leaks(told.encode(), TAG_SECRETS) == []
+def test_nothing_of_it_is_stored_or_said(folder, limbfit_and_libraries):
+    for words in (["series"], ["check"], ["run", "--until", "sites"], ["status", "--json"]):
+        code, out, err = limbfit_and_libraries(*words, folder)
+        assert code == 0, err
+        assert leaks((out + err).encode(), TAG_SECRETS) == []
     study = load_study(folder)
     write_result(study.results / "run.json", run_record(study))
     assert_private(study.results)
@@ -178,7 +160,7 @@ def copied(folder: Path, place: Path) -> tuple[Path, Path]:
     ],
 )
 @pytest.mark.usefixtures("commands_unasked")
-def test_errors_tell_no_value_of_a_tag(folder, tmp_path, monkeypatch, capfd, changes):
+def test_errors_tell_no_value_of_a_tag(folder, tmp_path, limbfit_and_libraries, changes):
     copy, file = copied(folder, tmp_path)
     data = pydicom.dcmread(file)
     for tag, value in changes.items():
@@ -187,7 +169,7 @@ def test_errors_tell_no_value_of_a_tag(folder, tmp_path, monkeypatch, capfd, cha
         else:
             setattr(data, tag, value)
     data.save_as(file)
-    check_silent(copy, monkeypatch, capfd)
+    check_silent(copy, limbfit_and_libraries)
 
 
 @pytest.mark.parametrize(
@@ -195,16 +177,17 @@ def test_errors_tell_no_value_of_a_tag(folder, tmp_path, monkeypatch, capfd, cha
     [b"MARKERX1", b"DS\x10\x00", b"UI\x0e\x00", b"7777003", b"PN\x18\x00", b"19470911", b"CS\x02\x00MR"],
 )
 @pytest.mark.usefixtures("commands_unasked")
-def test_damaged_tags_tell_no_value_either(folder, tmp_path, monkeypatch, capfd, old):
+def test_damaged_tags_tell_no_value_either(folder, tmp_path, limbfit_and_libraries, old):
     """Bytes of values and of their lengths overwritten, which makes pydicom and GDCM complain of them."""
     copy, file = copied(folder, tmp_path)
     file.write_bytes(file.read_bytes().replace(old, bytes(reversed(old)), 1))
-    check_silent(copy, monkeypatch, capfd)
+    check_silent(copy, limbfit_and_libraries)
 
 
-def check_silent(folder: Path, monkeypatch, capfd) -> None:
-    for words in (["series", str(folder)], ["check", str(folder)]):
-        code, told = call(words, monkeypatch, capfd)
+def check_silent(folder: Path, limbfit) -> None:
+    for verb in ("series", "check"):
+        code, *shown = limbfit(verb, folder)
+        told = "".join(shown)
         assert code in (0, 2), told
         assert leaks(told.replace("mri-MARKERXQ", "").encode(), [*TAG_SECRETS, "MARKERXR"]) == []
         assert "Traceback" not in told
@@ -212,7 +195,7 @@ def check_silent(folder: Path, monkeypatch, capfd) -> None:
 
 
 @pytest.mark.slow
-def test_no_path_is_in_the_results_of_a_whole_run(study, tmp_path, monkeypatch, capfd):
+def test_no_path_is_in_the_results_of_a_whole_run(study, tmp_path, limbfit_and_libraries):
     """Calibration, predictions, report and a single simulation of a study with names in its paths."""
     place = study.rename(tmp_path / "study-MARKERXP")
     names = {"skin.stl": "MARKERXQ.stl", "tibia.stl": "b-MARKERXR.stl", "1.csv": "MARKERXS-1.csv"}
@@ -221,8 +204,8 @@ def test_no_path_is_in_the_results_of_a_whole_run(study, tmp_path, monkeypatch, 
         (place / old).rename(place / new)
         text = text.replace(f'"{old}"', f'"{new}"')
     (place / "study.toml").write_text(text)
-    for words in (["run", str(place)], ["simulate", str(place), "--site", "2"]):
-        code, told = call(words, monkeypatch, capfd)
-        assert code == 0, told
+    for words in (["run", place], ["simulate", place, "--site", "2"]):
+        code, _, err = limbfit_and_libraries(*words)
+        assert code == 0, err
     assert (place / "results" / "report" / "report.html").is_file()
     assert_private(place / "results")

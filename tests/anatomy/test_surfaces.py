@@ -23,7 +23,7 @@ from limbfit.anatomy.surfaces.surfaces import (
     save_anatomy,
     write_surface,
 )
-from limbfit.anatomy.surfaces.triangles import from_pyvista
+from limbfit.anatomy.surfaces.triangles import from_pyvista, stack_surfaces
 from limbfit.errors import LabelError, SurfaceError
 
 
@@ -83,9 +83,7 @@ def half_flipped(surface):
 
 
 def doubled(surface):
-    shifted = surface.points + np.array([200.0, 0, 0])
-    faces = np.vstack([surface.faces, surface.faces + len(surface.points)])
-    return Surface(np.vstack([surface.points, shifted]), faces)
+    return stack_surfaces([surface, replace(surface, points=surface.points + np.array([200.0, 0, 0]))])
 
 
 def dented_through(surface):

@@ -41,6 +41,18 @@ def section_of(text: str, name: str) -> str:
     return found.group()
 
 
+def table_of(text: str, name: str) -> str:
+    found = re.search(rf'<table id="table-{name}">.*?</table>', text, re.DOTALL)
+    assert found, name
+    return found.group()
+
+
+def cells_of(text: str, table: str) -> list[list[str]]:
+    """What stands in a table, row by row."""
+    rows = re.findall(r"<tr>\s*(.*?)\s*</tr>", table_of(text, table), re.DOTALL)
+    return [re.findall(r">([^<]*)</t[hd]>", row) for row in rows]
+
+
 def without_scripts(text: str) -> str:
     return re.sub(r"<script.*?</script>", "", text, flags=re.DOTALL)
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 import pytest
-from page_outline import Outline, section_of, without_scripts
+from page_outline import Outline, cells_of, section_of, table_of, without_scripts
 from stored_results import SITES as ALL_SITES
 from stored_results import write_results
 
@@ -127,21 +127,17 @@ def test_numbers_with_units(report: str) -> None:
 
 
 def test_parameter_table_shows_start_both_stages_interval_and_truth(report: str) -> None:
-    table = re.search(r'<table id="table-parameters">.*?</table>', report, re.DOTALL)
-    assert table
-    rows = re.findall(r"<tr>\s*(.*?)\s*</tr>", table.group(), re.DOTALL)
-    cells = [re.findall(r">([^<]*)</t[hd]>", row) for row in rows]
+    cells = cells_of(report, "parameters")
     assert cells[0][3:] == ["Start", "One material", "Two materials", "95 % interval", "Verdict", "Truth"]
     assert cells[2][3:] == ["3.00", "4.82", "4.52", "2.71 to 7.68", "weakly determined", "4.40"]
     assert len(cells) == 9
 
 
 def test_site_table_marks_the_fitted(report: str) -> None:
-    table = re.search(r'<table id="table-sites">.*?</table>', report, re.DOTALL)
-    assert table
-    marked = re.findall(r'<tr class="marked">\s*<th scope="row">([^<]*)</th>', table.group())
+    table = table_of(report, "sites")
+    marked = re.findall(r'<tr class="marked">\s*<th scope="row">([^<]*)</th>', table)
     assert marked == [site for site, _, fitted, *_ in SITES if fitted]
-    assert "0.9 ± 0.3" in table.group()
+    assert "0.9 ± 0.3" in table
 
 
 def test_labels_of_an_image_that_the_study_has_no_more_are_not_reported(tmp_path: Path) -> None:

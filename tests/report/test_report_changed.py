@@ -1,12 +1,11 @@
 """Reports of studies in which something is more, missing, broken or hostile."""
 
 import json
-import re
 import shutil
 from pathlib import Path
 
 import pytest
-from page_outline import Outline, render_sections, section_of, without_scripts
+from page_outline import Outline, cells_of, render_sections, section_of, without_scripts
 from stored_results import SITES, add_fat, leave_unarranged, write_results
 
 from completing import complete, write_result
@@ -53,10 +52,7 @@ def copy(results: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path
 def test_three_tissues_stand_in_every_table_and_curve(copy: Path) -> None:
     text = build_report(add_fat(copy), copy / "report").read_text(encoding="utf-8")
     assert Outline(text).open == []
-    table = re.search(r'<table id="table-parameters">.*?</table>', text, re.DOTALL)
-    assert table
-    rows = re.findall(r"<tr>\s*(.*?)\s*</tr>", table.group(), re.DOTALL)
-    cells = [re.findall(r">([^<]*)</t[hd]>", row) for row in rows]
+    cells = cells_of(text, "parameters")
     assert cells[0][4:6] == ["One material", "Three materials"]
     assert [row[0] for row in cells[1:]] == ["Skin"] * 4 + ["Fat"] * 4 + ["Muscle"] * 4
     assert cells[5][3:] == ["4.70", "4.71", "1.80", "0.900 to 3.60", "not determined", "1.80"]

@@ -13,7 +13,6 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parents[1] / "anatomy"))
 from bodies import limb
 
-from limbfit.anatomy.grid import build_limb_frame
 from limbfit.anatomy.meshing.layers import LayerSpec
 from limbfit.anatomy.meshing.meshing import MeshSettings, mesh_limb
 from limbfit.donning import Load, SocketFit, build_socket_problem, pack, simulate_donning, unpack
@@ -31,10 +30,9 @@ TISSUES = {"skin": OgdenQLV(0.009, 6.0, 2.0, 0.5), "muscle": OgdenQLV(0.004, 4.0
 def donned(tmp_path_factory):
     """The arguments of a simulation with derivatives, its outcome, and what was kept of each part."""
     anatomy, folder = limb(), tmp_path_factory.mktemp("parts")
-    frame = build_limb_frame(anatomy.cut_point, anatomy.cut_normal)
     trim = Trim([(anatomy.cut_point - 26.0 * anatomy.cut_normal, anatomy.cut_normal)])
     socket = rectify_limb(
-        anatomy.skin, frame, Recipe(trim=trim, reduction_percent=3.0, distal_clearance_mm=3.0)
+        anatomy.skin, anatomy.frame, Recipe(trim=trim, reduction_percent=3.0, distal_clearance_mm=3.0)
     )
     settings = MeshSettings(edge_near_mm=14.0, edge_far_mm=24.0, growth=0.6, layers=(LayerSpec("skin", 3.0),))
     mesh, _ = mesh_limb(anatomy, settings, 10.0)

@@ -46,7 +46,7 @@ def face() -> Socket:
     limb = round_limb()
     areas = [Area("press", np.array([0.0, -44.0, 60.0]), 22.0, 4.0)]
     recipe = Recipe(Trim([], LINE), flare_mm=6.0, areas=areas)
-    return rectify_limb(limb.skin, build_limb_frame(limb.cut_point, limb.cut_normal), recipe)
+    return rectify_limb(limb.skin, limb.frame, recipe)
 
 
 @pytest.fixture

@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 from socket_limbs import CUT_NORMAL, round_limb
 
-from limbfit.anatomy.grid import build_limb_frame
 from limbfit.anatomy.surfaces.files import write_surface
-from limbfit.anatomy.surfaces.triangles import Surface, close_by_fans
+from limbfit.anatomy.surfaces.triangles import Surface, close_by_fans, find_half_edges, stack_surfaces
 from limbfit.errors import SurfaceError
 from limbfit.socket import Recipe, Socket, read_socket, rectify_limb
 from limbfit.socket.rectify import Trim
@@ -22,16 +21,13 @@ TRIM = Trim([(np.array([0.0, 0.0, 112.0]), CUT_NORMAL)])
 
 def read(file: Path, unit: str = "mm", space: str | None = None) -> Socket:
     limb = round_limb()
-    frame = build_limb_frame(limb.cut_point, limb.cut_normal)
-    return read_socket(file, unit, space, outer=limb.skin, frame=frame, bones=limb.bones)  # type: ignore[arg-type]
+    return read_socket(file, unit, space, outer=limb.skin, frame=limb.frame, bones=limb.bones)  # type: ignore[arg-type]
 
 
 @cache
 def drawn() -> Socket:
     limb = round_limb()
-    return rectify_limb(
-        limb.skin, build_limb_frame(limb.cut_point, limb.cut_normal), Recipe(TRIM, flare_mm=0.0, edge_mm=6.0)
-    )
+    return rectify_limb(limb.skin, limb.frame, Recipe(TRIM, flare_mm=0.0, edge_mm=6.0))
 
 
 def face() -> Surface:
@@ -52,7 +48,7 @@ def walled(thickness: float = 4.0) -> Surface:
     strip = np.vstack([lower, upper])
     flipped = outer.faces[:, ::-1] + n
     body = Surface(np.vstack([inner.points, outer.points]), np.vstack([inner.faces, flipped, strip]))
-    edges = {tuple(e) for e in np.vstack([body.faces[:, [i, (i + 1) % 3]] for i in range(3)])}
+    edges = np.unique(find_half_edges(body.faces), axis=0)
     if len(edges) != 3 * len(body.faces):  # the brim runs the other way
         strip = strip[:, ::-1]
         body = Surface(body.points, np.vstack([inner.faces, flipped, strip]))
@@ -84,7 +80,7 @@ def test_inside_out_is_turned_and_said(tmp_path: Path) -> None:
     assert socket.volume_mm3 == pytest.approx(drawn().volume_mm3, rel=1e-5)
     assert "turned" in socket.notes[0]
     after = np.roll(socket.brim, -1)
-    edges = {tuple(e) for e in np.vstack([socket.faces[:, [i, (i + 1) % 3]] for i in range(3)])}
+    edges = {tuple(edge) for edge in find_half_edges(socket.faces)}
     assert all(edge in edges for edge in zip(socket.brim, after))
 
 
@@ -112,10 +108,9 @@ def test_skin_and_bones_below_an_open_end_are_not_those_of_the_socket(tmp_path: 
     assert not covered[height > 112.0].any()
     assert covered[(height > 60.0) & (height < 105.0)].all()
     low = limb.bones["tibia"].points - np.array([38.0, 0.0, 0.0])
-    frame = build_limb_frame(limb.cut_point, limb.cut_normal)
     aside = {"tibia": Surface(low, limb.bones["tibia"].faces)}
     with pytest.raises(SurfaceError, match="into the bone tibia"):  # through the tube's side
-        read_socket(tmp_path / "tube.stl", outer=limb.skin, frame=frame, bones=aside)
+        read_socket(tmp_path / "tube.stl", outer=limb.skin, frame=limb.frame, bones=aside)
 
 
 @pytest.mark.parametrize("turned", [False, True])
@@ -167,8 +162,7 @@ def narrow() -> Surface:
 
 
 def twice() -> Surface:
-    points = np.vstack([face().points, moved(0.0, 0.0, 200.0).points])
-    return Surface(points, np.vstack([face().faces, face().faces + len(face().points)]))
+    return stack_surfaces([face(), moved(0.0, 0.0, 200.0)])
 
 
 BAD: dict[str, tuple[Callable[[], Surface], str]] = {  # what is said, of what, the remedy

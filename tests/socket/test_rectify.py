@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from socket_limbs import CUT_NORMAL, FILES, TOP, measure_circumference, real_limb, revolved, round_limb
 
-from limbfit.anatomy.grid import Frame, build_limb_frame
+from limbfit.anatomy.grid import build_limb_frame
 from limbfit.anatomy.surfaces.surfaces import Anatomy
-from limbfit.anatomy.surfaces.triangles import Surface
+from limbfit.anatomy.surfaces.triangles import Surface, find_half_edges
 from limbfit.errors import SurfaceError
 from limbfit.socket import Area, Recipe, Socket, rectify_limb
 from limbfit.socket.landmarks import find_knee_centre
@@ -20,13 +20,9 @@ TRIM = Trim([(np.array([0.0, 0.0, 115.0]), CUT_NORMAL)])
 PLAIN = Recipe(TRIM, flare_mm=0.0, distal="bearing")
 
 
-def frame_of(anatomy: Anatomy) -> Frame:
-    return build_limb_frame(anatomy.cut_point, anatomy.cut_normal)
-
-
 def made(recipe: Recipe = PLAIN, anatomy: Anatomy | None = None) -> Socket:
     anatomy = anatomy or round_limb()
-    return rectify_limb(anatomy.skin, frame_of(anatomy), recipe)
+    return rectify_limb(anatomy.skin, anatomy.frame, recipe)
 
 
 @cache
@@ -48,7 +44,7 @@ def check_face(socket: Socket, anatomy: Anatomy) -> None:
     face, clear = socket.surface, Surface(socket.clear, socket.faces)
     assert len(face.self_intersections) == len(clear.self_intersections) == 0
     assert socket.closed_surface.volume > 0
-    edges = np.sort(np.vstack([socket.faces[:, [i, (i + 1) % 3]] for i in range(3)]), axis=1)
+    edges = np.sort(find_half_edges(socket.faces), axis=1)
     alone, counts = np.unique(edges, axis=0, return_counts=True)
     brim = np.sort(np.column_stack([socket.brim, np.roll(socket.brim, -1)]), axis=1)
     assert {tuple(e) for e in alone[counts == 1]} == {tuple(e) for e in brim}
@@ -124,7 +120,7 @@ def test_a_position_on_the_skin_means_the_liner_outside_it() -> None:
     liner = Surface(limb.skin.points * [1.15, 1.15, 1.0], limb.skin.faces)  # some 6 mm off the skin
     at = np.array([0.0, -44.4, 80.0])
     recipe = replace(PLAIN, reduction_percent=0.0, areas=[Area("front", at, 25.0, 5.0)])
-    depth = rectify_limb(liner, frame_of(limb), recipe).offset(liner)
+    depth = rectify_limb(liner, limb.frame, recipe).offset(liner)
     assert depth.max() == pytest.approx(5.0, rel=0.04)
 
 

@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from limbfit.anatomy.grid import build_limb_frame
 from limbfit.anatomy.surfaces.surfaces import write_surface
 from limbfit.anatomy.surfaces.triangles import Surface, remove_unused_points
 from limbfit.socket import Recipe, rectify_limb
@@ -38,9 +37,8 @@ def with_file(folder: Path, text: str) -> Path:
 def drawn() -> Surface:
     anatomy = limb()
     trim = Trim([(anatomy.cut_point - [0.0, 0.0, 26.0], anatomy.cut_normal)])
-    frame = build_limb_frame(anatomy.cut_point, anatomy.cut_normal)
     return rectify_limb(
-        anatomy.skin, frame, Recipe(trim, flare_mm=0.0, distal_clearance_mm=3.0, edge_mm=8.0)
+        anatomy.skin, anatomy.frame, Recipe(trim, flare_mm=0.0, distal_clearance_mm=3.0, edge_mm=8.0)
     ).surface
 
 

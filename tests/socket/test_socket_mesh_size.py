@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from socket_limbs import CUT_NORMAL, round_limb
 
-from limbfit.anatomy.grid import build_limb_frame
 from limbfit.pipeline.socket.shape import mesh_edge_mm
 from limbfit.socket import Recipe, Socket, rectify_limb
 from limbfit.socket.rectify import Trim
@@ -18,7 +17,7 @@ from small_limb import small_limb
 def shank() -> Socket:
     limb = round_limb()
     recipe = Recipe(Trim([(np.array([0.0, 0.0, 112.0]), CUT_NORMAL)]), 3.0, edge_mm=5.0)
-    return rectify_limb(limb.skin, build_limb_frame(limb.cut_point, limb.cut_normal), recipe)
+    return rectify_limb(limb.skin, limb.frame, recipe)
 
 
 def of_size(socket: Socket, factor: float) -> Socket:

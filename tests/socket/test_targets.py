@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from socket_limbs import CUT_NORMAL, round_limb
 
-from limbfit.anatomy.grid import build_limb_frame
 from limbfit.errors import SurfaceError
 from limbfit.socket import Recipe, rectify_limb
 from limbfit.socket.landmarks import build_default_regions, find_directions
@@ -17,7 +16,7 @@ LIMB = round_limb()
 REGIONS = build_default_regions(LIMB, find_directions(LIMB))
 FACE = rectify_limb(
     LIMB.skin,
-    build_limb_frame(LIMB.cut_point, LIMB.cut_normal),
+    LIMB.frame,
     Recipe(Trim([(np.array([0.0, 0.0, 112.0]), CUT_NORMAL)]), 0.0, distal="bearing", edge_mm=5.0),
 )
 POINTS = LIMB.skin.triangles.mean(axis=1)

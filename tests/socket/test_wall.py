@@ -9,7 +9,6 @@ import pytest
 import trimesh
 from socket_limbs import CUT_NORMAL, FILES, real_limb, round_limb
 
-from limbfit.anatomy.grid import build_limb_frame
 from limbfit.anatomy.surfaces.files import write_surface
 from limbfit.anatomy.surfaces.triangles import Surface
 from limbfit.errors import SurfaceError
@@ -28,7 +27,7 @@ def drawn_plain() -> Socket:
 
 def drawn(recipe: Recipe) -> Socket:
     limb = round_limb()
-    return rectify_limb(limb.skin, build_limb_frame(limb.cut_point, limb.cut_normal), recipe)
+    return rectify_limb(limb.skin, limb.frame, recipe)
 
 
 def read_back(body: Surface, folder: Path) -> trimesh.Trimesh:
@@ -105,5 +104,5 @@ def test_real_limbs(tmp_path: Path, name: str) -> None:
     knee = find_knee_centre(limb)
     assert knee is not None
     trim = Trim([(knee - 15.0 * limb.cut_normal, limb.cut_normal)])
-    socket = rectify_limb(limb.skin, build_limb_frame(limb.cut_point, limb.cut_normal), Recipe(trim))
+    socket = rectify_limb(limb.skin, limb.frame, Recipe(trim))
     check_wall(socket, limb.cut_normal, tmp_path, 4.0)
