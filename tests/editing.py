@@ -21,12 +21,12 @@ def write_study(folder: Path, text: str, files: Sequence[str] = ("skin.stl", "1.
     return load_study(folder)
 
 
-def edit(study: Path, old: str, new: str) -> None:
-    """Replace what stands in the file wherever it stands; it has to be there."""
+def edit(study: Path, old: str, new: str, count: int = -1) -> None:
+    """Replace what stands in the file wherever it stands, or ``count`` times; it has to be there."""
     file = study / "study.toml"
     text = file.read_text(encoding="utf-8")
     assert old in text
-    file.write_text(text.replace(old, new), encoding="utf-8")
+    file.write_text(text.replace(old, new, count), encoding="utf-8")
 
 
 def append(study: Path, text: str) -> None:

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from editing import edit
 from limbfit.anatomy.surfaces.surfaces import write_surface
 from limbfit.anatomy.surfaces.triangles import Surface, remove_unused_points
 from limbfit.socket import Recipe, rectify_limb
@@ -27,9 +28,9 @@ depth_mm = 19.0
 
 def with_file(folder: Path, text: str) -> Path:
     """The small limb's study with a socket from a file."""
-    file = small_limb(folder, text) / "study.toml"
+    small_limb(folder, text)
     for line in OF_RECTIFICATION:
-        file.write_text(file.read_text().replace(line, ""))
+        edit(folder, line, "")
     return folder
 
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from socket_limbs import CUT_NORMAL, round_limb
 
+from editing import edit
 from limbfit.pipeline.socket.shape import mesh_edge_mm
 from limbfit.socket import Recipe, Socket, rectify_limb
 from limbfit.socket.rectify import Trim
@@ -25,8 +26,7 @@ def of_size(socket: Socket, factor: float) -> Socket:
 
 
 def study_of(folder, edge: str) -> Study:
-    study = small_limb(folder, "") / "study.toml"
-    study.write_text(study.read_text().replace("edge_mm = 14.0\n", edge))
+    edit(small_limb(folder, ""), "edge_mm = 14.0\n", edge)
     return load_study(folder)
 
 

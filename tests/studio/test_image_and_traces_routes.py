@@ -11,7 +11,7 @@ import pytest
 from limb_image import make_segmented
 from serving_here import open_page
 
-from editing import edit
+from editing import append, edit
 from limbfit import run_study
 from limbfit.anatomy.imaging import read_labels
 from limbfit.pipeline.engine.store import lock
@@ -116,8 +116,8 @@ def test_image_and_labels_lie_where_the_study_has_them(limb, tmp_path):
 
 def test_stated_times_are_stored_beside_the_comments(study):
     file = study / "study.toml"
-    text = file.read_text().replace('trace = "1.csv"', 'trace = "1.csv"  # by the robot')
-    file.write_text(text + "[traces]\nsmoothing = 0.1\n")
+    edit(study, 'trace = "1.csv"', 'trace = "1.csv"  # by the robot')
+    append(study, "[traces]\nsmoothing = 0.1\n")
     run_study(load_study(study), until="traces")
     client = open_page(study)
     found = client.get("/api/traces/1").json()

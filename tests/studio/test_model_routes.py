@@ -10,7 +10,7 @@ import pyvista as pv
 from serving_here import open_page
 
 from completing import write_result
-from editing import edit
+from editing import append, edit
 from limbfit import load_study
 from limbfit.mesh import Mesh, boundary_faces, measure_quality, write_vtu
 from limbfit.results.limb import MeshResult
@@ -86,12 +86,11 @@ def test_a_click_becomes_a_site_of_the_study_within_a_millimetre(page, study):
 
 
 def test_the_records_of_a_site_follow_its_new_name(page, study):
-    file = study / "study.toml"
     more = '[[records]]\nsite = "{}"\nname = "slow"  # by hand\ntrace = "2.csv"\n'
-    file.write_text(file.read_text() + more.format("2") + more.format("1"))
+    append(study, more.format("2") + more.format("1"))
     assert page.post("/api/model/sites/2", json={"name": "heel"}).status_code == 200
     assert [record.name for record in load_study(study).recorded] == ["1", "1-slow", "heel", "heel-slow"]
-    assert file.read_text().count('name = "slow"  # by hand') == 2
+    assert (study / "study.toml").read_text().count('name = "slow"  # by hand') == 2
 
 
 def test_a_site_is_moved_named_and_switched(page, study):
@@ -109,10 +108,8 @@ def test_a_site_is_moved_named_and_switched(page, study):
 
 def test_changes_that_come_at_once_are_all_stored(study):
     file, regions = study / "study.toml", [f"region {i}" for i in range(12)]
-    file.write_text(
-        file.read_text()
-        + "".join(f'[[sites]]\nname = "s{i}"\nposition = [40, {i}, 60]\ndepth_mm = 4\n' for i in range(12))
-    )
+    for i in range(12):
+        append(study, f'[[sites]]\nname = "s{i}"\nposition = [40, {i}, 60]\ndepth_mm = 4\n')
     with ThreadPoolExecutor(12) as threads:
         list(threads.map(lambda i: set_site(file, f"s{i}", {"region": regions[i]}), range(12)))
     assert [load_study(study).site(f"s{i}").region for i in range(12)] == regions
@@ -160,13 +157,12 @@ def test_a_site_with_a_place_from_markups_stays_where_it_is(page, study):
     markups = {"markups": [{"type": "Fiducial", "coordinateSystem": "LPS", "controlPoints": [
         {"label": "2", "position": point}]}]}  # fmt: skip
     (study / "places.mrk.json").write_text(json.dumps(markups))
-    file = study / "study.toml"
-    text = file.read_text().replace("position = [0.0, 40.0, 50.0]\n", "")
-    file.write_text(text + '\n[markups]\nfile = "places.mrk.json"\n')
+    edit(study, "position = [0.0, 40.0, 50.0]\n", "")
+    append(study, '\n[markups]\nfile = "places.mrk.json"\n')
     answer = page.post("/api/model/sites/2", json={"position": [0.0, 40.0, 50.0]})
     assert answer.status_code == 422
     assert "markups file" in answer.json()["error"]
-    assert "position" not in tomllib.loads(file.read_text())["sites"][1]
+    assert "position" not in tomllib.loads((study / "study.toml").read_text())["sites"][1]
 
 
 def _meshed(study) -> Mesh:

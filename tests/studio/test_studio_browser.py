@@ -11,7 +11,7 @@ from limb_image import make_segmented
 from serving_here import serve_here as serve_here
 
 from browsing import serious_findings, until
-from editing import append
+from editing import append, edit
 from limbfit import run_study
 from limbfit.anatomy.imaging import read_labels
 from limbfit.study import load_study
@@ -23,8 +23,8 @@ SIZES = ((1280, 800), (1920, 1080))
 def test_a_dragged_touch_down_is_stored_and_hostile_names_stay_text(study, serve_here, open_page):
     file = study / "study.toml"
     hostile = "<img src=x onerror=window.hacked=1><script>window.hacked=1</script>"
-    text = file.read_text().replace('"stump"', f'"{hostile}"')
-    file.write_text(text.replace('name = "1"', f'name = "1"  # first\nregion = "{hostile}"'))
+    edit(study, '"stump"', f'"{hostile}"')
+    edit(study, 'name = "1"', f'name = "1"  # first\nregion = "{hostile}"')
     run_study(load_study(study), until="traces")
     address = serve_here(study)
     page = open_page(address + "#/traces")

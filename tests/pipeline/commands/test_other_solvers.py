@@ -12,6 +12,7 @@ import xml.etree.ElementTree as ET
 import numpy as np
 import pytest
 
+from editing import edit
 from layered import block_context, block_study
 from limbfit import compare_site, export_study, load_study, simulate_feb, simulate_site
 from limbfit.errors import InputError
@@ -77,11 +78,9 @@ register_law(TissueLaw("own-neo-hookean", "neo-Hookean", "W = mu/2 (I1 - 3)", (M
 def test_what_febios_fit_cannot_identify_is_refused_early(tmp_path, material, more, site, words):
     (tmp_path / "own.py").write_text(OWN_LAW, encoding="utf-8")
     block_study(tmp_path, "", "", site)
-    file = tmp_path / "study.toml"
-    text = file.read_text().replace("[material]", f"[material]\n{material}")
+    edit(tmp_path, "[material]", f"[material]\n{material}")
     if more:
-        text = text.replace("[study]", more, 1)
-    file.write_text(text, encoding="utf-8")
+        edit(tmp_path, "[study]", more, count=1)
     with pytest.raises(InputError, match=f"study.toml: a: FEBio's fit .*{words}"):
         check_export(load_study(tmp_path), "febio-optimize")
     check_export(load_study(tmp_path), "feb")

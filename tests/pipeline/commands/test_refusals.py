@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from editing import edit
 from limbfit import (
     check_study,
     design_socket,
@@ -37,10 +38,7 @@ BONELESS = ('bones = { tibia = "tibia.stl" }', "")
 
 
 def with_change(folder: Path, change: tuple[str, str]):
-    file = folder / "study.toml"
-    text = file.read_text()
-    assert change[0] in text
-    file.write_text(text.replace(*change, 1))
+    edit(folder, *change, count=1)
     return load_study(folder)
 
 
@@ -178,8 +176,7 @@ def test_records_are_read_before_the_limb_is_made(study):
 def test_all_records_are_judged_before_the_first_is_made(study, limbfit):
     """The first needs a device that is not there: who asks for it ends with exit code 1."""
     (study / "1.csv").unlink()
-    text = (study / "study.toml").read_text()
-    (study / "study.toml").write_text(text.replace(FAST[0], FAST[1].replace("1.csv", "f.csv"), 1))
+    edit(study, FAST[0], FAST[1].replace("1.csv", "f.csv"), count=1)
     words = ("acquire", study, "--unattended", "--depth", "5", "--device", "tcp://127.0.0.1:9")
     code, _, errors = limbfit(*words)
     assert code == 2

@@ -130,9 +130,8 @@ def test_the_record_of_a_run_names_no_program_and_no_extension(alone, tmp_path):
     outside = tmp_path / "jane"
     outside.mkdir()
     (outside / "own.py").write_text("")
-    file = alone / "study.toml"
-    stated = file.read_text().replace("[study]", f'[study]\nextensions = ["{outside}/own.py"]')
-    file.write_text(f'{stated}[febio]\nprogram = "{outside}/febio4"\n')
+    edit(alone, "[study]", f'[study]\nextensions = ["{outside}/own.py"]')
+    append(alone, f'[febio]\nprogram = "{outside}/febio4"\n')
     record = run_record(load_study(alone))
     assert "jane" not in record.model_dump_json()
     assert record.settings["febio"]["program"].startswith("sha256:")

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from editing import edit
 from limbfit.anatomy.sites.sites import compute_indenter_axis
 from limbfit.anatomy.surfaces.surfaces import Anatomy
 from limbfit.errors import SiteError
@@ -17,10 +18,10 @@ from small_limb import small_limb
 
 def place_changed(folder: Path, *changes: tuple[str, str]) -> tuple[PlacedSite, Anatomy]:
     """The first site of the small limb, some words of whose study are others, and the limb's surfaces."""
-    file = small_limb(folder, "") / "study.toml"
+    small_limb(folder, "")
     for stated, instead in changes:
-        file.write_text(file.read_text().replace(stated, instead))
-    study = load_study(file)
+        edit(folder, stated, instead)
+    study = load_study(folder)
     anatomy, _ = read_given_anatomy(study)
     return place_site(study.sites[0], study, anatomy, None), anatomy
 
