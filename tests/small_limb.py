@@ -1,11 +1,8 @@
 """A small limb with one bone as a study of surfaces, for tests of sockets."""
 
-import sys
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).parent / "anatomy"))
 from bodies import limb, revolved
-
 from limbfit.anatomy.surfaces.surfaces import write_surface
 
 LIMB = """

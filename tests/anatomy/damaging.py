@@ -3,9 +3,8 @@
 import sys
 from pathlib import Path
 
-from limbs import write_dicom
-
 from limbfit.anatomy.imaging import Volume
+from limbs import write_dicom
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
 

@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
-from limbs import DIRECTIONS, leg_image
 
 from limbfit.anatomy.imaging import LabelMap
 from limbfit.anatomy.segmentation.amputation import amputate_limb
 from limbfit.errors import LabelError, SurfaceError
+from limbs import DIRECTIONS, leg_image
 
 PAD = 16.0
 

@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from limbs import DIRECTIONS, leg_image
 
 from limbfit.anatomy.labels.labelfiles import (
     fill_even_odd,
@@ -11,6 +10,7 @@ from limbfit.anatomy.labels.labelfiles import (
     write_contours,
 )
 from limbfit.errors import LabelError
+from limbs import DIRECTIONS, leg_image
 
 SHAPE, SPACING = (12, 40, 44), [1.2, 1.3, 5.0]
 

@@ -5,8 +5,8 @@ from functools import cache
 
 import numpy as np
 import pytest
-from bodies import ellipsoid, limb
 
+from bodies import ellipsoid, limb
 from limbfit.anatomy.imaging import read_labels, write_labels
 from limbfit.anatomy.meshing.engines import VolumeTask, run_netgen
 from limbfit.anatomy.meshing.layers import LayerSpec, build_limb_fields, evaluate_distance

@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 from damage import KINDS, Kind, Whole
 from damaged_inputs import FORK, judge, make_whole, read_whole, run_case
-from limbs import leg_image, rotation, write_dicom
 
 from limbfit.anatomy.surfaces.surfaces import build_anatomy
+from limbs import leg_image, rotation, write_dicom
 
 SEED = 1
 ROOMS = ("dicom", "file", "labels", "surfaces")

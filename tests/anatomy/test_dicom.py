@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
-from limbs import CALF, DIRECTIONS, IDENTITY, volume, write_dicom
 from pydicom.uid import generate_uid
 
 from limbfit.anatomy.images.dicom import list_series
 from limbfit.anatomy.imaging import read_volume
 from limbfit.errors import ImageError
+from limbs import CALF, DIRECTIONS, IDENTITY, volume, write_dicom
 
 
 def refusal(folder, **options) -> str:

@@ -4,13 +4,13 @@ import numpy as np
 import pydicom
 import pytest
 from damaging import write_rtstruct, write_seg
-from limbs import DIRECTIONS, volume, write_dicom
 from test_labels import labels_on
 
 from limbfit.anatomy.grid import SOFT_TISSUE
 from limbfit.anatomy.imaging import LabelMap, read_labels
 from limbfit.anatomy.labels.labelfiles import fill_even_odd
 from limbfit.errors import LabelError
+from limbs import DIRECTIONS, volume, write_dicom
 
 RANDOM = np.random.default_rng(3)
 

@@ -7,9 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from bodies import limb
-from limbs import SHARED, rotation
 
+from bodies import limb
 from limbfit.anatomy.meshing import improving, meshing
 from limbfit.anatomy.meshing.background import compute_volumes
 from limbfit.anatomy.meshing.engines import ENGINES, VolumeMesh
@@ -25,6 +24,7 @@ from limbfit.anatomy.meshing.meshing import MeshSettings, build_base_mesh, mesh_
 from limbfit.anatomy.sites.sites import compute_indenter_axis, project_to_skin
 from limbfit.errors import MeshingError
 from limbfit.mesh import check, measure_quality
+from limbs import SHARED, rotation
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
 import foreign_meshes

@@ -6,10 +6,10 @@ import nrrd
 import numpy as np
 import pytest
 import SimpleITK as sitk  # noqa: N813
-from limbs import DIRECTIONS, volume
 
 from limbfit.anatomy.imaging import LabelMap, Volume, read_labels, read_volume, write_volume
 from limbfit.errors import ImageError, LabelError
+from limbs import DIRECTIONS, volume
 
 TOLERANCE_MM = 0.01
 

@@ -5,12 +5,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from limbs import CALF, leg_image
 
 from limbfit.anatomy.imaging import LabelMap, Volume, check_image, read_volume
 from limbfit.anatomy.labels.labelcheck import clean_labels
 from limbfit.anatomy.segmentation.body import check_one_limb
 from limbfit.errors import ImageError, LabelError
+from limbs import CALF, leg_image
 
 PATH = Path("labels.nrrd")
 

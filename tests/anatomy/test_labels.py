@@ -7,11 +7,11 @@ import nrrd
 import numpy as np
 import pytest
 import slicerio
-from limbs import DIRECTIONS, volume
 
 from limbfit.anatomy.grid import SOFT_TISSUE
 from limbfit.anatomy.imaging import LabelMap, read_labels, write_labels, write_volume
 from limbfit.errors import LabelError
+from limbs import DIRECTIONS, volume
 
 NAMES = {1: SOFT_TISSUE, 2: "tibia", 3: "fibula", 9: "bone-1"}
 

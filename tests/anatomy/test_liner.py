@@ -2,9 +2,8 @@
 
 import numpy as np
 import pytest
-from bodies import limb
-from limbs import rotation
 
+from bodies import limb
 from limbfit.anatomy.meshing.layers import (
     LayerSpec,
     build_limb_fields,
@@ -15,6 +14,7 @@ from limbfit.anatomy.meshing.meshing import MeshSettings, mesh_limb
 from limbfit.anatomy.surfaces.surfaces import Anatomy
 from limbfit.anatomy.surfaces.triangles import check_closed
 from limbfit.mesh import measure_quality
+from limbs import rotation
 
 THICKNESS = 6.0
 SETTINGS = MeshSettings(

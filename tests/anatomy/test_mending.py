@@ -5,13 +5,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from bodies import limb
-from limbs import rotation
 
+from bodies import limb
 from limbfit.anatomy.surfaces.mending import build_closed_anatomy, find_flat_ends, open_loops, repair_surface
 from limbfit.anatomy.surfaces.surfaces import Surface, check_anatomy, check_closed
 from limbfit.anatomy.surfaces.triangles import from_pyvista, remove_unused_points
 from limbfit.errors import SurfaceError
+from limbs import rotation
 
 
 @pytest.fixture(scope="module")

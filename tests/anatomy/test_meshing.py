@@ -8,9 +8,8 @@ from importlib.util import find_spec
 import igl
 import numpy as np
 import pytest
-from bodies import limb
-from limbs import OPENLIMB, rotation
 
+from bodies import limb
 from limbfit.anatomy.meshing import engines
 from limbfit.anatomy.meshing.extrusion import build_columns
 from limbfit.anatomy.meshing.improving import curve_diagonals
@@ -21,6 +20,7 @@ from limbfit.anatomy.surfaces.surfaces import Anatomy, Surface, read_surface
 from limbfit.errors import MeshingError, SurfaceError
 from limbfit.mesh import Mesh, boundary_faces, measure_quality, to_tet10
 from limbfit.mesh.cells import quadratic_simplex
+from limbs import OPENLIMB, rotation
 
 COARSE = MeshSettings(edge_near_mm=6.0, edge_far_mm=17.0, near_radius_mm=10.0, growth=0.7)
 

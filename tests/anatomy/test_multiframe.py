@@ -6,13 +6,13 @@ import numpy as np
 import pydicom
 import pytest
 from damaging import enhanced
-from limbs import DIRECTIONS, IDENTITY, volume, write_dicom
 from pydicom.dataset import Dataset
 from pydicom.uid import EnhancedCTImageStorage
 
 from limbfit.anatomy.images.dicom import describe_series
 from limbfit.anatomy.imaging import read_volume
 from limbfit.errors import ImageError
+from limbs import DIRECTIONS, IDENTITY, volume, write_dicom
 
 ORDER = [4, 0, 6, 2, 5, 1, 3]
 

@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import SimpleITK as sitk  # noqa: N813
-from limbs import dice, write_dicom
 
 from limbfit.anatomy.grid import BONES, FAT, Volume
 from limbfit.anatomy.imaging import read_volume
@@ -22,6 +21,7 @@ from limbfit.anatomy.segmentation.segmentation import segment
 from limbfit.errors import ImageError
 from limbfit.phantom.geometry import SKIN_AND_FAT, Limb, make_limb
 from limbfit.phantom.mri import CONTRASTS, make_grid
+from limbs import dice, write_dicom
 from scanned import build_image
 
 SEED = 2

@@ -10,12 +10,12 @@ from pathlib import Path
 import numpy as np
 import pydicom
 import pytest
-from limbs import leg_image, rotation, write_dicom
 
 from conftest import COARSE
 from limbfit import load_study
 from limbfit.pipeline.commands.run import run_record
 from limbfit.pipeline.engine.store import write_result
+from limbs import leg_image, rotation, write_dicom
 
 IN_TAGS = {
     "PatientName": "QUIXOTE^ALONSO^MARKERX1",

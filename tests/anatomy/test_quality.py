@@ -5,10 +5,10 @@ import json
 import matplotlib.image
 import numpy as np
 import pytest
-from limbs import DIRECTIONS, leg_image
 
 from limbfit.anatomy.labels.labelcheck import LIMB, assess_labels
 from limbfit.report.drawing.sheet import draw_sheet
+from limbs import DIRECTIONS, leg_image
 
 SHAPE, SPACING = (62, 60, 60), [2.0, 2.0, 2.5]
 

@@ -6,7 +6,6 @@ import nrrd
 import numpy as np
 import pytest
 import pyvista as pv
-from limbs import leg_image, rotation
 
 from limbfit.anatomy.imaging import LabelMap, Volume, read_labels, read_volume
 from limbfit.anatomy.meshing.meshing import MeshSettings, mesh_site
@@ -16,6 +15,7 @@ from limbfit.anatomy.surfaces.surfaces import (
     build_anatomy,
 )
 from limbfit.mesh import write_vtu
+from limbs import leg_image, rotation
 
 TOLERANCE_MM, EDGE_MM = 0.01, 8.0
 OBLIQUE = rotation(2) @ np.diag([1.0, -1.0, 1.0])  # left-handed: rows run backward

@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from limbs import CALF, DIRECTIONS, dice, leg_image
 from scipy.ndimage import label
 
 from limbfit.anatomy.grid import BONES
@@ -13,6 +12,7 @@ from limbfit.anatomy.segmentation.segmentation import segment
 from limbfit.errors import ImageError
 from limbfit.phantom.geometry import make_limb
 from limbfit.phantom.mri import generate_slabs, make_grid
+from limbs import CALF, DIRECTIONS, dice, leg_image
 
 SHAPE, SPACING = (62, 60, 60), [2.0, 2.0, 2.5]
 

@@ -6,13 +6,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import pyvista as pv
-from bodies import limb
-from limbs import OPENLIMB
 
+from bodies import limb
 from limbfit.anatomy.sites.sites import compute_indenter_axis, compute_square_edges, project_to_skin
 from limbfit.anatomy.surfaces.surfaces import Anatomy, read_surface
 from limbfit.anatomy.surfaces.triangles import from_pyvista
 from limbfit.errors import SiteError
+from limbs import OPENLIMB
 
 
 @pytest.fixture(scope="module")

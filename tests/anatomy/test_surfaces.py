@@ -6,7 +6,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import pyvista as pv
-from limbs import DIRECTIONS, Leg, grid, leg_image, rotation, write_dicom
 from scipy.spatial import cKDTree
 
 from limbfit.anatomy.imaging import LabelMap, Volume, read_volume
@@ -25,6 +24,7 @@ from limbfit.anatomy.surfaces.surfaces import (
 )
 from limbfit.anatomy.surfaces.triangles import from_pyvista, stack_surfaces
 from limbfit.errors import LabelError, SurfaceError
+from limbs import DIRECTIONS, Leg, grid, leg_image, rotation, write_dicom
 
 
 def ball(radius: float = 50.0, centre=(10.0, -20.0, 30.0)) -> Surface:

@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from bodies import limb, revolved
 
+from bodies import limb, revolved
 from limbfit.anatomy.meshing import meshing
 from limbfit.anatomy.meshing.background import compute_volumes
 from limbfit.anatomy.meshing.layers import build_limb_fields

@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
-from bodies import limb
-from limbs import rotation
 
+from bodies import limb
 from limbfit.anatomy.segmentation.amputation import amputate_anatomy, voxelise_anatomy
 from limbfit.anatomy.surfaces.surfaces import check_anatomy
 from limbfit.errors import LabelError
+from limbs import rotation
 
 PAD, EDGE = 10.0, 5.0
 

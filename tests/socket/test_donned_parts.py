@@ -3,16 +3,12 @@
 With one thread: what several add up comes in any order.
 """
 
-import sys
 from dataclasses import asdict
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "anatomy"))
 from bodies import limb
-
 from limbfit.anatomy.meshing.layers import LayerSpec
 from limbfit.anatomy.meshing.meshing import MeshSettings, mesh_limb
 from limbfit.donning import Load, SocketFit, build_socket_problem, pack, simulate_donning, unpack

@@ -1,14 +1,9 @@
 """What a socket's loads do to the tissue in figures, on a block of which all of them are known."""
 
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "anatomy"))
 from bodies import limb
-
 from limbfit.donning import Load, LoadedState, SocketFit, Strains, build_socket_steps
 from limbfit.identify.checks.domain import ANGLE, LEVEL, PRESSURE, RATE, SHEAR, TIME, Extent, RecordedRange
 from limbfit.mesh import Mesh, boundary_faces, cell_volumes

@@ -1,14 +1,8 @@
 """Wrong records are told by ``limbfit check`` and shown in the report."""
 
-import sys
-from pathlib import Path
-
 import nibabel
 import numpy as np
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parents[2] / "anatomy"))
-from limbs import leg_image
 
 from completing import write_result
 from conftest import write_trace
@@ -19,6 +13,7 @@ from limbfit.report.page import Bullets
 from limbfit.report.sections.inputs import make_model_section, make_record_check_section
 from limbfit.report.store import load_store
 from limbfit.results.identification import PredictResult
+from limbs import leg_image
 
 PLACES = ([40.0, 0.0, 60.0], [0.0, 40.0, 50.0], [-40.0, 0.0, 60.0], [0.0, -40.0, 55.0], [28.0, 28.0, 55.0])
 

@@ -5,14 +5,10 @@ Meshes, exports and sockets come back in tests/mesh, tests/febio and tests/socke
 
 import json
 import shutil
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parents[2] / "anatomy"))
-from limbs import leg_image, rotation
 
 from conftest import write_trace
 from limbfit import check_study, load_study, run_study
@@ -21,6 +17,7 @@ from limbfit.anatomy.surfaces.surfaces import Surface, load_anatomy, write_surfa
 from limbfit.errors import SurfaceError
 from limbfit.pipeline.records.traces import read_record
 from limbfit.traces import read_trace
+from limbs import leg_image, rotation
 
 IMAGE = """
 [image]

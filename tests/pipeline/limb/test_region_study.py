@@ -1,6 +1,5 @@
 """A region inside the core as a tissue of a study: felt by a site over it, exported, identified."""
 
-import sys
 import xml.etree.ElementTree as ET
 from dataclasses import replace
 from functools import partial
@@ -9,9 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parents[2] / "anatomy"))
 from bodies import ellipsoid, limb
-
 from limbfit import load_study, run_study
 from limbfit.anatomy.meshing.meshing import MeshSettings, mesh_site
 from limbfit.anatomy.surfaces.surfaces import write_surface

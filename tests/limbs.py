@@ -1,4 +1,4 @@
-"""Synthetic limbs, grids and DICOM files for the tests of this room."""
+"""Synthetic limbs, grids and DICOM files."""
 
 from pathlib import Path
 
@@ -8,7 +8,7 @@ from pydicom.uid import CTImageStorage, ExplicitVRLittleEndian, MRImageStorage, 
 
 from limbfit.anatomy.imaging import LabelMap, Volume
 
-SHARED = Path(__file__).parents[2] / ".." / "shared"
+SHARED = Path(__file__).parents[1] / ".." / "shared"
 CALF = SHARED / "data" / "calf-mri"
 OPENLIMB = SHARED / "reference" / "openlimb-study"
 
