@@ -160,5 +160,4 @@ def leg_image(
     bias = 1 + 0.2 * np.sin(p[..., 0] / 60) * np.cos(p[..., 2] / 70)
     real, imaginary = (random.normal(0, noise, image.shape) for _ in range(2))
     array = 700 * np.hypot(image * cover * bias + real, imaginary)
-    place = (labels.spacing, labels.origin, labels.direction)
-    return Volume(array, *place), LabelMap(truth, *place)
+    return Volume(array, *labels.geometry), LabelMap(truth, *labels.geometry)

@@ -1,5 +1,7 @@
 """DICOM-SEG and RTSTRUCT as label maps on the grid of their image."""
 
+from dataclasses import replace
+
 import numpy as np
 import pydicom
 import pytest
@@ -7,7 +9,7 @@ from damaging import write_rtstruct, write_seg
 from test_labels import labels_on
 
 from limbfit.anatomy.grid import SOFT_TISSUE
-from limbfit.anatomy.imaging import LabelMap, read_labels
+from limbfit.anatomy.imaging import read_labels
 from limbfit.anatomy.labels.labelfiles import fill_even_odd
 from limbfit.errors import LabelError
 from limbs import DIRECTIONS, volume, write_dicom
@@ -138,7 +140,7 @@ def test_contours_without_an_image_are_refused(tmp_path):
 def test_segments_on_another_grid_are_refused(tmp_path):
     image = volume(DIRECTIONS["oblique"])
     labels = labels_on(image)
-    moved = LabelMap(labels.array, labels.spacing, labels.index_to_point([0.5, 0, 0]), labels.direction)
+    moved = replace(labels, origin=labels.index_to_point([0.5, 0, 0]))
     write_seg(tmp_path / "labels.dcm", moved, RANDOM)
     with pytest.raises(LabelError, match="different grid"):
         read_labels(tmp_path / "labels.dcm", image)

@@ -22,7 +22,7 @@ def labels_on(image, names=NAMES) -> LabelMap:
     array[1:6, 1:5, 1:4] = 1
     array[2:4, 2:4, 1:3] = 2
     array[4, 2, 2] = 9
-    return LabelMap(array, image.spacing, image.origin, image.direction, names)
+    return LabelMap(array, *image.geometry, names)
 
 
 @pytest.mark.parametrize("suffix", [".seg.nrrd", ".nrrd", ".nii.gz", ".mha"])

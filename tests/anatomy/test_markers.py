@@ -27,7 +27,7 @@ def mask_of(volume: Volume) -> np.ndarray:
 
 def skin_of(volume: Volume) -> Surface:
     mask = mask_of(volume).astype(np.uint8)
-    return extract_surface(LabelMap(mask, volume.spacing, volume.origin, volume.direction), None, 4.0)
+    return extract_surface(LabelMap(mask, *volume.geometry), None, 4.0)
 
 
 @cache

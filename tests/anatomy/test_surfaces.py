@@ -296,7 +296,7 @@ def test_the_proximal_end_is_found_along_every_axis_and_sense(leg):
 
 def test_a_limb_cut_off_by_the_images_side_is_refused(leg):
     with pytest.raises(LabelError, match="side of the image"):
-        build_anatomy(LabelMap(leg.array[:, :, 16:], leg.spacing, leg.origin, leg.direction), 5.0)
+        build_anatomy(leg.with_array(leg.array[:, :, 16:]), 5.0)
 
 
 def test_a_bone_outside_the_skin_is_refused(anatomy):
@@ -334,10 +334,10 @@ def test_a_physical_point_survives_from_dicom_to_stl(tmp_path, name):
     empty = grid((24, 30, 32), [2.0, 2.0, 2.5], DIRECTIONS[name])
     array = np.zeros(empty.array.shape)
     array[4:20, 5:25, 6:26] = 800
-    image = Volume(array, empty.spacing, empty.origin, empty.direction)
+    image = Volume(array, *empty.geometry)
     write_dicom(tmp_path / "dicom", image)
     back = read_volume(tmp_path / "dicom")
-    labels = LabelMap(back.array > 400, back.spacing, back.origin, back.direction)
+    labels = LabelMap(back.array > 400, *back.geometry)
     write_surface(tmp_path / "slab.stl", extract_surface(labels, None, 2.5))
     surface = read_surface(tmp_path / "slab.stl")
     # The middles of the slab's faces, half a voxel outside its outermost voxels, in the image as it was made.

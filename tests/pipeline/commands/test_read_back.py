@@ -5,6 +5,7 @@ Meshes, exports and sockets come back in tests/mesh, tests/febio and tests/socke
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -46,11 +47,7 @@ def with_scar(labels: LabelMap) -> LabelMap:
     away = np.linalg.norm((points[:, ::-1] - middle) * labels.spacing - [22.0, 0.0, 0.0], axis=1)
     array = labels.array.copy()
     array[tuple(points[away < 7.0].T)] = 9
-    return LabelMap(array, *labels_place(labels), {**labels.names, 9: "scar"})
-
-
-def labels_place(labels: LabelMap):
-    return labels.spacing, labels.origin, labels.direction
+    return replace(labels, array=array, names={**labels.names, 9: "scar"})
 
 
 @pytest.fixture(scope="module")

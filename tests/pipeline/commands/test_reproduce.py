@@ -53,8 +53,7 @@ def test_an_image_goes_with_its_voxels_and_a_study_by_any_name_into_no_folder_of
     assert (other / "study.toml").read_text() == "of another patient"
     again = load_study(tmp_path / "again")
     assert read_volume(again.path(again.image.path)).size == (7, 6, 5)
-    changed = Volume(image.array + 1.0, image.spacing, image.origin, image.direction)
-    write_volume(study / "scan [1].mhd", changed)
+    write_volume(study / "scan [1].mhd", image.with_array(image.array + 1.0))
     with pytest.raises(InputError, match=r"has changed since: image\.path"):
         reproduce_study(study / "limb.toml", tmp_path / "other", listener=stop_at())
 

@@ -40,7 +40,7 @@ def build_leg(above: int = 0, below: int = 0) -> LabelMap:
 def build_surfaces(folder: Path, labels: LabelMap, geometry: str) -> Anatomy:
     """What the stage makes of a leg under some keys of ``[geometry]``."""
     write_labels(folder / "labels.seg.nrrd", labels)
-    image = Volume(labels.array, labels.spacing, labels.origin, labels.direction)
+    image = Volume(labels.array, *labels.geometry)
     write_volume(folder / "image.nrrd", image)
     (folder / "study.toml").write_text(TEXT.format(geometry=geometry))
     study = load_study(folder)

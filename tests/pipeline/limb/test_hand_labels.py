@@ -93,7 +93,7 @@ def test_hand_work_is_kept_where_the_study_names_labels(tmp_path):
     y, x = np.indices((20, 20)) - 9.5
     leg = np.repeat([np.where(np.hypot(x, y) < 9, 1, 0) + np.where(np.hypot(x, y) < 4, 1, 0)], 16, axis=0)
     made = LabelMap(leg, [4.0] * 3, np.zeros(3), np.eye(3), {1: "soft tissue", 2: "tibia"})
-    write_volume(tmp_path / "image.nrrd", Volume(leg, made.spacing, made.origin, made.direction))
+    write_volume(tmp_path / "image.nrrd", Volume(leg, *made.geometry))
     found = {}
     for name, labels in (("first", made), ("second", with_a_notch(with_a_notch(made)))):
         write_labels(tmp_path / f"{name}.seg.nrrd", labels)
