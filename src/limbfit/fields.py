@@ -10,7 +10,6 @@ import numpy as np
 
 from .arrays import Array
 from .fe import Problem, State, Step, System
-from .fe.kernel.laws import Laws
 from .fe.memory import Memory
 from .fe.observables import (
     average_at_nodes,
@@ -35,7 +34,7 @@ def state_fields(system: System, problem: Problem, state: State) -> tuple[dict[s
     ``displacement_mm`` moves the points from rest.  The state is one of a `Step` that `iterate` yields, or
     the one kept with ``store="peak"``.
     """
-    laws = _build_laws(problem)
+    laws = problem.build_laws()
     fields = compute_element_fields(system, laws, state)
     cauchy = fields.cauchy / KPA
     point_data = {
@@ -57,7 +56,7 @@ def state_fields(system: System, problem: Problem, state: State) -> tuple[dict[s
 
 def rest(system: System, problem: Problem) -> State:
     """The state before the first step."""
-    memory = Memory.rest(system, _build_laws(problem))
+    memory = Memory.rest(system, problem.build_laws())
     return State(
         0.0, problem.history.displacement_at(0.0), np.zeros_like(problem.mesh.points), 0.0, memory=memory
     )
@@ -89,7 +88,3 @@ class Animation:
         write_fields(self.system, self.problem, state, frame)
         self.frames.append((state.time, frame))
         write_pvd(self.file, self.frames)
-
-
-def _build_laws(problem: Problem) -> Laws:
-    return Laws.build([problem.materials[region] for region in problem.mesh.region_names])

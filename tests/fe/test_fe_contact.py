@@ -6,7 +6,6 @@ from blocks import MUSCLE, SKIN, block, check_derivatives, drive, punch
 
 from limbfit.errors import ProblemError
 from limbfit.fe import History, Indenter, OgdenQLV, Problem, StepControl, System, solve
-from limbfit.fe.kernel.laws import Laws
 from limbfit.fe.system import Increment
 
 
@@ -22,7 +21,7 @@ from limbfit.fe.system import Increment
 def test_contact_force_and_stiffness_are_derivatives_of_its_energy(shape, radius, cell_type, rule):
     tool = Indenter(shape, 20.0, radius, centre=(0.3, -0.4, 2.0), axis=(0.1, 0.05, -1.0))
     problem = punch(cell_type, 4, 1, indenter=tool, contact_rule=rule, start="as-given")
-    system, laws = System(problem), Laws.build([SKIN, MUSCLE])
+    system, laws = System(problem), problem.build_laws()
     rest = np.zeros((*system.weights.shape, 6))
 
     def at(u, d):

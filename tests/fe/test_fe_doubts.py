@@ -9,7 +9,6 @@ from blocks import punch
 from limbfit import OgdenQLV
 from limbfit.bench.timing import build_punched_block
 from limbfit.fe import History, Problem, Result, StepControl, solve
-from limbfit.fe.kernel.laws import Laws
 from limbfit.fe.observables import compute_contact_pressure
 from limbfit.fe.result import find_inverted_elements
 from limbfit.fe.system import Increment
@@ -35,8 +34,7 @@ def kinds(result: Result) -> list[str]:
 
 def reactions(result: Result) -> np.ndarray:
     """Force along the axis (n,) of the states' own penalties, N."""
-    laws = Laws.build([result.problem.materials[name] for name in result.problem.mesh.region_names])
-    nothing, found = np.zeros(0), []
+    laws, nothing, found = result.problem.build_laws(), np.zeros(0), []
     for state in result.states:
         penalty = state.penalty * laws.modulus
         increment = Increment(state.time, state.displacement, nothing, nothing, penalty, state.drives)
@@ -67,7 +65,7 @@ def test_a_state_s_penalty_is_the_one_that_holds_it(problem):
     """Also where raising it did not help enough: reactions and pressure were three times the force's."""
     result = solve(problem, StepControl(penetration=1e-6, load_steps=1, unload_steps=1), store="all")
     np.testing.assert_allclose(reactions(result), result.force[1:], rtol=1e-3, atol=1e-6)
-    laws = Laws.build([problem.materials[name] for name in problem.mesh.region_names])
+    laws = problem.build_laws()
     deepest = max(result.states, key=lambda state: state.displacement)
     usual = solve(problem, StepControl(load_steps=1, unload_steps=1))
     pressures = [

@@ -4,10 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from blocks import block
+from blocks import block, untouched
 from numba import typeof
 
-from limbfit.fe import ELEMENTS, History, OgdenQLV, Problem, Support, System
+from limbfit.fe import ELEMENTS, OgdenQLV, Problem, Support, System
 from limbfit.fe.kernel.laws import Laws
 from limbfit.fe.observables import compute_element_fields
 from limbfit.fe.solution.control import StepControl
@@ -19,17 +19,15 @@ TISSUE = OgdenQLV(0.005, 4.8, 3.6, 0.3)
 LINES = np.linspace(0.0, 4.0, 4)
 
 
-def body(name: str, fixed=None, supports=(), history=None, jitter: float = 0.25, lines=LINES) -> Problem:
+def body(name: str, fixed=None, supports=(), jitter: float = 0.25, lines=LINES) -> Problem:
     mesh = block(ELEMENTS[name].cell_type, lines, lines, lines, jitter=jitter)
-    history = history or History(np.array([0.0, 1.0]), np.array([0.0, 1.0]))
     fixed = mesh.node_sets["bottom"] if fixed is None else fixed
-    materials = {"skin": TISSUE, "muscle": TISSUE}
-    faces = np.zeros((0, 3), dtype=int)
-    return Problem(mesh, materials, fixed, faces, None, history, supports=supports, element=name)
+    return untouched(mesh, TISSUE, fixed=fixed, supports=supports, element=name)
 
 
 def prepared(name: str) -> tuple[System, Laws, Increment]:
-    system, laws = System(body(name)), Laws.build([TISSUE, TISSUE])
+    problem = body(name)
+    system, laws = System(problem), problem.build_laws()
     history = 1e-3 * np.random.default_rng(3).normal(size=(*system.weights.shape, 6))
     return system, laws, Increment(0.0, 0.0, np.array([2.5, 2.5]), history, 1.0)
 
@@ -104,10 +102,10 @@ def test_patch(name):
     edge = np.flatnonzero((X <= 1e-9).any(axis=1) | (X >= 4.0 - 1e-9).any(axis=1))
     target = X @ gradient.T
     supports = tuple(Support(np.array([n]), i, target[n, i]) for n in edge for i in range(3))
-    problem = body(name, np.zeros(0, dtype=int), supports)
+    problem = body(name, (), supports)
     run = list(iterate(problem, StepControl(times=(0.5, 1.0), tolerance=1e-9)))
     np.testing.assert_allclose(run[-1].state.u, target, atol=1e-8)
-    fields = compute_element_fields(System(problem), Laws.build([TISSUE, TISSUE]), run[-1].state)
+    fields = compute_element_fields(System(problem), problem.build_laws(), run[-1].state)
     spread = fields.cauchy - fields.cauchy.mean(axis=0)
     assert np.abs(spread).max() < 1e-7 * np.abs(fields.cauchy).max()
     np.testing.assert_allclose(fields.J, np.linalg.det(gradient + np.eye(3)), rtol=1e-8)
@@ -122,12 +120,12 @@ def bending(X: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize(("name", "order"), [("tet4", 1), ("tet10", 2), ("hex8", 1)])
 def test_interpolated_energy_converges(name, order):
     """The energy of an interpolated smooth field converges at twice the order of its gradient."""
-    law = Laws.build([TISSUE, TISSUE])
+    laws = Laws.build([TISSUE, TISSUE])
     energies = []
     for n in (2, 4, 8) if order == 2 else (4, 8, 16):
         lines = np.linspace(0.0, 1.0, n + 1)
         system = System(body(name, lines=lines, jitter=0.0))
         rest = Increment(0.0, 0.0, np.ones(2), np.zeros((*system.weights.shape, 6)), 1.0)
-        energies.append(system.evaluate(bending(system.points), law, rest).energy)
+        energies.append(system.evaluate(bending(system.points), laws, rest).energy)
     changes = np.abs(np.diff(energies))
     assert np.log2(changes[-2] / changes[-1]) > 2 * order - 0.35

@@ -2,13 +2,12 @@
 
 import numpy as np
 import pytest
-from blocks import block
+from blocks import block, untouched
 from numba import njit
 from samples import SAMPLES, energy, kirchhoff, point, quotients, slopes
 
-from limbfit.fe import ELEMENTS, History, Problem, System
+from limbfit.fe import ELEMENTS, System
 from limbfit.fe.kernel.assembly import assemble
-from limbfit.fe.kernel.laws import Laws
 from limbfit.fe.lanes import LANES, block_places, exponential, logarithm
 from limbfit.fe.memory import compute_elastic_stresses
 
@@ -90,13 +89,12 @@ def deformed(name: str):
     lines = np.linspace(0.0, 1.0, 3)
     mesh = block(ELEMENTS[name].cell_type, lines, lines, np.linspace(0.0, 1.5, 4), layer=0.5, jitter=0.05)
     tissues = {"skin": SAMPLES["paper"], "muscle": SAMPLES["mooney-rivlin"]}
-    faces = mesh.face_sets["top"][:0]
-    ramp = History(np.array([0.0, 1.0]), np.array([0.0, 1.0]))
-    system = System(Problem(mesh, tissues, mesh.node_sets["bottom"], faces, None, ramp, element=name))
+    problem = untouched(mesh, tissues, fixed=mesh.node_sets["bottom"], element=name)
+    system = System(problem)
     rng = np.random.default_rng(11)
     u = system.points @ (0.15 * rng.normal(size=(3, 3))) + 0.01 * rng.normal(size=system.points.shape)
     K = 1e-3 * rng.normal(size=(*system.weights.shape, 6))
-    return system, Laws.build(list(tissues.values())), np.array([1.5, 2.5]), K, u
+    return system, problem.build_laws(), np.array([1.5, 2.5]), K, u
 
 
 def assembled(case, cells: slice, tangent: bool):

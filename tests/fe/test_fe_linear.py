@@ -77,8 +77,7 @@ def test_halves_of_solutions_make_the_whole_and_those_among_the_last_unknowns_ar
 
 def at_rest(problem: Problem, advance: float = 0.0) -> tuple[System, Laws, np.ndarray]:
     """The undeformed system, its laws and its tangent under an indenter that has gone ``advance`` mm."""
-    system = System(problem)
-    laws = Laws.build([problem.materials[name] for name in problem.mesh.region_names])
+    system, laws = System(problem), problem.build_laws()
     increment = Memory.rest(system, laws).build_increment(
         system, laws, 0.1, 0.1, advance, 100.0 * laws.modulus, drive(advance)
     )
@@ -115,8 +114,7 @@ def test_springs_on_held_nodes_are_no_columns_of_unknowns_that_go_last():
     problem = punch("tet10", 2, 1)
     held = np.union1d(problem.fixed, problem.contact_faces[0])
     system = System(replace(problem, fixed=held))
-    laws = Laws.build([problem.materials[name] for name in problem.mesh.region_names])
-    factor = Factor(system, laws.moduli)
+    factor = Factor(system, problem.build_laws().moduli)
     assert not len(factor.solver.last)
     assert not factor.columns.inner.any()
     assert len(factor.columns.W) == system.unknowns

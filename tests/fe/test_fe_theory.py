@@ -4,18 +4,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
-from blocks import block, refined, symmetry
+from blocks import block, refined, symmetry, untouched
 from samples import SAMPLES, relaxed
 from scipy.integrate import quad
 from scipy.optimize import brentq
 
 from limbfit.fe import ELEMENTS, History, Indenter, NeoHookean, Problem, StepControl, Support, System, iterate
-from limbfit.fe.kernel.laws import Laws
 from limbfit.fe.observables import compute_element_fields
 from limbfit.fe.system import Increment
 
 NONE = np.zeros(0, dtype=int)
-NO_FACES = np.zeros((0, 3), dtype=int)
 
 
 def test_uniaxial_compression_with_relaxation():
@@ -42,10 +40,8 @@ def uniaxial(law, history: History, times: np.ndarray) -> np.ndarray:
     X = mesh.points
     planes = tuple(Support(np.flatnonzero(X[:, i] == 0.0), i) for i in range(3))
     top = Support(np.flatnonzero(X[:, 2] == 1.0), 2, -1.0)
-    problem = Problem(
-        mesh, {"skin": law, "muscle": law}, NONE, NO_FACES, None, history, supports=(*planes, top)
-    )
-    system, laws = System(problem), Laws.build([law, law])
+    problem = untouched(mesh, law, history, supports=(*planes, top))
+    system, laws = System(problem), problem.build_laws()
     steps = iterate(problem, StepControl(times=tuple(times), tolerance=1e-8))
     found = {step.time: compute_element_fields(system, laws, step.state).cauchy[0, 2] for step in steps}
     return np.array([found[t] for t in times])  # a step may have been cut
@@ -202,10 +198,7 @@ def relative_errors(element: str, n: int, body: HalfSpace) -> np.ndarray:
     target, _ = papkovich(X, body.nu)
     supports = tuple(Support(np.array([a]), i, target[a, i]) for a in edge for i in range(3))
     law = NeoHookean(body.mu, kappa_ratio=body.kappa_ratio)
-    ramp = History(np.array([0.0, 1.0]), np.array([0.0, 1.0]))
-    problem = Problem(
-        mesh, {"skin": law, "muscle": law}, NONE, NO_FACES, None, ramp, supports=supports, element=element
-    )
+    problem = untouched(mesh, law, supports=supports, element=element)
     *_, step = iterate(problem, StepControl(times=(1.0,), tolerance=1e-8))
     system, u = System(problem), step.state.u[mesh.cells]
     N, _ = system.element.shape(system.element.points)
@@ -238,15 +231,11 @@ def bonded(element: str, n: int, kappa_ratio: float) -> float:
     top, middle = np.flatnonzero(z > 5.0 - 1e-9), np.flatnonzero(z < 1e-9)
     plates = (Support(middle, 2), Support(top, 0), Support(top, 1), Support(top, 2, -1.0))
     law = NeoHookean(0.01, kappa_ratio=kappa_ratio)
-    ramp = History(np.array([0.0, 1.0]), np.array([0.0, 1.0]))
-    problem = Problem(
-        mesh, {"skin": law, "muscle": law}, NONE, NO_FACES, None, ramp,
-        supports=(*symmetry(mesh), *plates), element=element,
-    )  # fmt: skip
+    problem = untouched(mesh, law, supports=(*symmetry(mesh), *plates), element=element)
     *_, step = iterate(problem, StepControl(times=(0.5, 1.0), tolerance=1e-6))
-    system, rest = System(problem), Increment(1.0, 1.0, np.ones(2), 0.0, 1.0)
-    rest = replace(rest, history=np.zeros((*system.weights.shape, 6)))
-    at = system.evaluate(step.state.u, Laws.build([law, law]), rest)
+    system = System(problem)
+    rest = Increment(1.0, 1.0, np.ones(2), np.zeros((*system.weights.shape, 6)), 1.0)
+    at = system.evaluate(step.state.u, problem.build_laws(), rest)
     return 4 * float(-at.residual[top, 2].sum())
 
 

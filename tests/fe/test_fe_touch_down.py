@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from blocks import parameter_slope, punch
+from blocks import check_sensitivities, punch
 from test_fe_fibres import ASKEW, GROUND, TISSUE
 
 from limbfit import History, Indenter, Problem
@@ -31,15 +31,6 @@ def clamped(**changes) -> Problem:
     pin = Indenter("square", 16.0, 1.0, axis=(0, 0, -1), centre=(20.0, 18.0, 0.0))
     motion = Motion.of([0.0, 1.0, end], force={"z": [0.0, 0.4, 0.4]})
     return replace(problem, bodies=(RigidBody(pin, problem.contact_faces, motion, name="clamp"),))
-
-
-def check_derivatives(problem: Problem, *parameters: tuple[str, str]) -> None:
-    """Derivatives of the force by parameters are those of central differences."""
-    centre = solve(problem, CONTROL, sensitivities=True, store="all")
-    assert centre.completed, centre.reason
-    for tissue, name in parameters:
-        slope, difference = parameter_slope(centre, CONTROL, tissue, name)
-        np.testing.assert_allclose(slope, difference, atol=1e-3 * np.abs(difference).max(), err_msg=name)
 
 
 def test_it_touches_the_tissue_where_that_is_by_then():
@@ -75,11 +66,11 @@ def test_what_nothing_moves_is_touched_where_it_is(how):
 
 
 def test_derivatives_of_tensed_tissue():
-    check_derivatives(tensed(), ("muscle", "active"), ("skin", "tau"))
+    check_sensitivities(tensed(), CONTROL, 1e-3, ("muscle", "active"), ("skin", "tau"))
 
 
 def test_derivatives_beside_a_clamp():
-    check_derivatives(clamped(friction=0.3), ("muscle", "c"))
+    check_sensitivities(clamped(friction=0.3), CONTROL, 1e-3, ("muscle", "c"))
 
 
 def test_what_cannot_be_is_refused():

@@ -4,10 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from blocks import COARSE_Z, FINE_Z, MUSCLE, SKIN, punch
+from blocks import COARSE_Z, FINE_Z, punch
 
 from limbfit.fe import History, Indenter, Motion, RigidBody, StepControl, solve
-from limbfit.fe.kernel.laws import Laws
 from limbfit.fe.observables import compute_contact_pressure, compute_nodal_forces
 from limbfit.fe.tractions import compute_tractions
 
@@ -29,7 +28,7 @@ def test_tractions_balance_the_forces_and_moments_that_are_stated(friction, n, z
     assert found.completed, found.reason
     assert found.imbalance.shape == (5, 1)
     assert (found.imbalance[1:] < 1e-3).all()
-    state, laws = found.states[-1], Laws.build([SKIN, MUSCLE])
+    state, laws = found.states[-1], problem.build_laws()
     on = compute_tractions(found.system, laws, state)
     frame = ball.frame
     np.testing.assert_allclose(frame @ on.force, found.reactions[-1, 0, :3], atol=1e-6)

@@ -15,7 +15,6 @@ import numpy as np
 
 from ..errors import InputError
 from ..fe import Indenter, Problem, StepControl, System, iterate, solve
-from ..fe.kernel.laws import Laws
 from ..fe.observables import compute_element_fields
 from ..febio import FebioLog, read_feb, read_log, run_feb, to_problem
 
@@ -166,8 +165,7 @@ def bench_febio_parity(
 def compare_stress(case: ReferenceCase, folder: Path) -> Row:
     """Axial Cauchy stress and volume ratio of a cube of one element."""
     problem, control, log = load_case(case, folder)
-    system = System(problem)
-    laws = Laws.build([problem.materials[name] for name in problem.mesh.region_names])
+    system, laws = System(problem), problem.build_laws()
     fields = [compute_element_fields(system, laws, step.state) for step in iterate(problem, control)]
     stress, J = np.array([f.cauchy[0, 2] for f in fields]), np.array([f.J[0] for f in fields])
     if len(fields) < len(control.times or ()):

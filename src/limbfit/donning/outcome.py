@@ -56,7 +56,7 @@ def simulate_donning(
     keep : called when donning and each load but the last have been held.
     begin : of an earlier call of the same, which goes on from there.
     """
-    laws = Laws.build([problem.materials[name] for name in problem.mesh.region_names])
+    laws = problem.build_laws()
     system = System(problem)
     patches = {WHOLE: np.ones(len(problem.bodies[0].faces), dtype=bool), **regions}
     rows = [] if begin is None else list(begin.rows)

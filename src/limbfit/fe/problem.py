@@ -15,6 +15,7 @@ from ..mesh import Mesh
 from ..phases import MotionPhase, find_boundaries, find_loading_end, find_phases
 from .contact.rigid import Indenter
 from .kernel.elements import ELEMENTS, Element
+from .kernel.laws import Laws
 from .materials import Material
 from .motion import Activation, Drives, Motion, RigidBody, read_course
 from .pressure import Pressure
@@ -184,6 +185,10 @@ class Problem:
     def with_materials(self, materials: Mapping[str, Material]) -> Problem:
         """The same problem with other materials; a prepared system stays valid."""
         return replace(self, materials=materials)
+
+    def build_laws(self) -> Laws:
+        """The materials of all regions, as the kernels read them."""
+        return Laws.build([self.materials[name] for name in self.mesh.region_names])
 
     @cached_property
     def rigid_bodies(self) -> tuple[RigidBody, ...]:

@@ -14,7 +14,6 @@ from scipy.spatial.transform import Rotation
 from ..arrays import Array, Indices
 from ..errors import InputError, RunError, add_location
 from ..fe import Result, Step, System, solve
-from ..fe.kernel.laws import Laws
 from ..fe.observables import ElementFields, compute_element_fields, compute_nodal_forces
 from .parts import build_tissue
 from .penalty import FacePenalties
@@ -94,7 +93,7 @@ class LogTables:
         problem = system.problem
         self.model, self.problem, self.system = model, problem, system
         self.tissue = build_tissue(model)
-        self.laws = Laws.build([problem.materials[name] for name in problem.mesh.region_names])
+        self.laws = problem.build_laws()
         self.travel = find_drive(model).travel
         # The bodies of the problem by FEBio's name, in the problem's order.
         self.bodies = dict(zip(group_contacts(model), problem.rigid_bodies))

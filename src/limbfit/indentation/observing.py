@@ -335,7 +335,7 @@ def compute_wave_speeds(result: Result, places: Sequence[WavePlace]) -> tuple[Ar
 
     def find_speeds(materials: Mapping[str, Material], by: int = 0, step: float = 0.0) -> Array:
         """The speeds where parameter number ``by`` is larger by ``step``."""
-        laws = Laws.build([materials[name] for name in problem.mesh.region_names])
+        laws = problem.with_materials(materials).build_laws()
         moved = [np.zeros((len(regions.nodes), 3))]
         for state in states:
             u = state.u[regions.nodes]

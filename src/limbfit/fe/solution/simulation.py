@@ -13,7 +13,6 @@ from threadpoolctl import ThreadpoolController
 from ...arrays import Array
 from ...errors import ProblemError
 from ..contact.friction import StickyContact
-from ..kernel.laws import Laws
 from ..memory import Memory, compute_elastic_stresses
 from ..motion import Drives
 from ..problem import Problem
@@ -68,7 +67,7 @@ class SteppedRun:
         known = (system, None if warm_start is None else warm_start.system)
         fitting = (one for one in known if one is not None and one.fits(problem))
         self.system = next(fitting, None) or System(problem, control.threads)
-        self.laws = Laws.build([problem.materials[name] for name in problem.mesh.region_names])
+        self.laws = problem.build_laws()
         self.seconds: defaultdict[str, float] = defaultdict(float)
         moduli, threads, last = self.laws.moduli, control.threads, find_touched_unknowns(self.system, problem)
         self.planned = schedule_steps(problem.history, control, problem.turns)

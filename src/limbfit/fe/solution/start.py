@@ -17,7 +17,6 @@ from ...arrays import Array
 from ..bodies import count_body_rows
 from ..contact.contact import find_touching_offset
 from ..contact.friction import LAWS_OF_STICKING, Anchors, StickyContact
-from ..kernel.laws import Laws
 from ..memory import Memory
 from ..motion import Drives
 from ..problem import Problem
@@ -72,7 +71,7 @@ def build_grips(
 def compute_tangent_at_rest(system: System) -> Array:
     """Entries of the tangent of the undeformed body, before contact, with its problem's materials."""
     problem = system.problem
-    laws = Laws.build([problem.materials[name] for name in problem.mesh.region_names])
+    laws = problem.build_laws()
     start = problem.history.displacement_at(0.0)
     increment = Memory.rest(system, laws).build_increment(
         system, laws, 1.0, 1.0, start, 0.0, problem.drives(0.0)

@@ -16,7 +16,6 @@ from ... import report
 from ...arrays import Array
 from ...errors import InputError, RunError
 from ...fe import History, Material, Ogden, Problem, StepControl, Support, System, iterate
-from ...fe.kernel.laws import Laws
 from ...fe.materials import PronyTerms
 from ...fe.observables import compute_element_fields
 from ...indentation import build_materials
@@ -206,7 +205,7 @@ def compress(material: Material, times: Array, compression_percent: float) -> tu
         history=History(ramp, np.array([0.0, depth, 0.0, 0.0])),
         supports=(*planes, top),
     )
-    system, laws = System(problem), Laws.build([material])
+    system, laws = System(problem), problem.build_laws()
     found: dict[float, tuple[float, float]] = {}
     for step in iterate(problem, StepControl(times=tuple(times), tolerance=1e-7)):
         fields = compute_element_fields(system, laws, step.state)

@@ -16,7 +16,6 @@ import numpy as np
 from ...arrays import Array
 from ...errors import InputError
 from ...fe import solve
-from ...fe.kernel.laws import Laws
 from ...fe.observables import compute_element_fields
 from ...indentation import Parameters, Simulation, SimulationJob, build_problem, build_steps, to_parameters
 from ...mesh import read_vtu
@@ -55,8 +54,7 @@ def simulate_with_volumes(job: SimulationJob) -> Simulation:
     problem = build_problem(model, read_vtu(model.mesh), parameters)
     result, volumes = solve(problem, steps=build_steps(model), store="peak"), NO_VOLUME
     if result.states:
-        laws = Laws.build([problem.materials[name] for name in problem.mesh.region_names])
-        J = compute_element_fields(result.system, laws, result.states[-1]).J
+        J = compute_element_fields(result.system, problem.build_laws(), result.states[-1]).J
         centres = problem.mesh.points[problem.mesh.corners].mean(axis=1)
         near = np.linalg.norm(centres - np.array(model.position), axis=1) < model.indenter.width_mm
         volumes = summarise_volumes(J[near], result.system.weights.sum(axis=1)[near])
