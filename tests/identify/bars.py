@@ -12,6 +12,8 @@ import numpy as np
 from limbfit.identify.fit.objective import MeasuredCurve, SiteResponse
 from limbfit.identify.fit.parameters import Unknowns
 from limbfit.identify.uncertainty.intervals import EvaluationStore
+from limbfit.identify.uncertainty.noise import estimate_curve_noise
+from limbfit.identify.uncertainty.uncertainty import Uncertainty, estimate_uncertainty
 
 NAMES = tuple(
     f"{tissue}.{name}" for tissue in ("skin", "muscle") for name in ("c_kPa", "m", "gamma", "tau_s")
@@ -83,8 +85,12 @@ SITES = (
 )
 
 
-def simulate(parameters):
-    return [site.respond(parameters) for site in SITES]
+def simulate_at(sites):
+    """What simulates these sites, in their order."""
+    return lambda parameters: [site.respond(parameters) for site in sites]
+
+
+simulate = simulate_at(SITES)
 
 
 def records(noise: float = 0.0, seed: int = 0, truth: np.ndarray = TRUTH, sites=SITES) -> list[MeasuredCurve]:
@@ -114,8 +120,13 @@ def three_tissues(**own: list[float]) -> Unknowns:
     return Unknowns(THREE, np.concatenate(starts), np.tile(PAPER.lower[:4], 3), np.tile(PAPER.upper[:4], 3))
 
 
-def respond_three(parameters):
-    return [bar.respond(parameters) for bar in BARS]
+respond_three = simulate_at(BARS)
+
+
+def estimate(parameters, responses, data, unknowns=PAPER, **how) -> Uncertainty:
+    """What records tell of parameters with these responses; their noise is the scatter of neighbours."""
+    noise = estimate_curve_noise(responses, data)
+    return estimate_uncertainty(parameters, responses, data, unknowns, noise, **how)
 
 
 class Counted:

@@ -5,7 +5,7 @@ from zlib import crc32
 
 import numpy as np
 import pytest
-from bars import NAMES, PAPER, SITES, TRUTH, Counted, records, simulate
+from bars import NAMES, PAPER, SITES, TRUTH, Counted, records, simulate, simulate_at
 
 from limbfit.errors import CalibrationError
 from limbfit.identify.fit.calibration import Calibration, CalibrationSettings, calibrate
@@ -64,11 +64,7 @@ def test_a_prior_holds_what_the_data_do_not_show_and_hardly_what_they_do():
     muscle = tuple(replace(site, sections=(0.002, site.sections[1])) for site in SITES)
     data = records(0.03, sites=muscle)
     known = Prior("skin.c_kPa", 12.0, 1.5), Prior("muscle.c_kPa", 12.0, 1.5)
-
-    def respond(parameters):
-        return [site.respond(parameters) for site in muscle]
-
-    with_priors = calibrate(respond, data, replace(PAPER, priors=known))
+    with_priors = calibrate(simulate_at(muscle), data, replace(PAPER, priors=known))
     assert with_priors.converged, with_priors.reason
     assert with_priors.parameters[0] == pytest.approx(12.0, rel=0.1)
     assert with_priors.parameters[4] == pytest.approx(TRUTH[4], rel=0.1)

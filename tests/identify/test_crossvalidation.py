@@ -5,7 +5,7 @@ from math import comb
 
 import numpy as np
 import pytest
-from bars import PAPER, TRUTH, Bars
+from bars import PAPER, TRUTH, Bars, simulate_at
 
 from limbfit.errors import CalibrationError
 from limbfit.identify.checks.crossvalidation import (
@@ -25,8 +25,7 @@ SITES = [
 ]
 
 
-def simulate(parameters):
-    return [site.respond(parameters) for site in SITES]
+simulate = simulate_at(SITES)
 
 
 def records(misfit=()):

@@ -5,7 +5,7 @@ from itertools import combinations
 
 import numpy as np
 import pytest
-from bars import PAPER, SITES, TRUTH
+from bars import PAPER, SITES, TRUTH, simulate
 
 from limbfit.errors import CalibrationError
 from limbfit.identify.checks.design import (
@@ -130,10 +130,7 @@ def test_expected_widths_are_those_that_repeated_fits_scatter_with():
             MeasuredCurve(f"s{k}", s.force(truth) + 0.03 * rng.standard_normal(s.points))
             for k, s in enumerate(SITES)
         ]
-        start = PAPER.__class__(PAPER.names, truth, PAPER.lower, PAPER.upper)
-        found = calibrate(
-            lambda p: [s.respond(p) for s in SITES], data, start, stages=(tuple(range(len(truth))),)
-        )
+        found = calibrate(simulate, data, PAPER.with_start(truth), stages=(group_separately(PAPER.names),))
         sd.append(np.log(found.parameters / truth))
     spread, said = np.std(sd, axis=0), np.log(expected.factors_95) / 1.96
     known = said < 0.2  # where the linearisation holds

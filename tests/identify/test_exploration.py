@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from bars import NAMES, PAPER, SITES, TRUTH, records, simulate
+from bars import NAMES, PAPER, SITES, TRUTH, estimate, records, simulate
 from coverage_study import coverage_study
 
 from limbfit.identify.fit.calibration import calibrate
@@ -11,21 +11,16 @@ from limbfit.identify.fit.parameters import build_space, group_by_kind, group_se
 from limbfit.identify.fit.prediction import compute_errors_percent
 from limbfit.identify.uncertainty.noise import estimate_curve_noise
 from limbfit.identify.uncertainty.posterior import ExplorationSettings, Posterior, explore_posterior
-from limbfit.identify.uncertainty.uncertainty import (
-    FitSensitivity,
-    compute_principal_axes,
-    estimate_uncertainty,
-)
+from limbfit.identify.uncertainty.uncertainty import FitSensitivity, compute_principal_axes
 from limbfit.results.uncertainty import LikelihoodProfile
 
 SPACE = build_space(PAPER, group_separately(NAMES))
 
 
-def calibrated(noise=0.03, seed=4, **extra):
-    data = records(noise, seed=seed)
+def calibrated(noise=0.03):
+    data = records(noise, seed=4)
     found = calibrate(simulate, data, PAPER.with_start(TRUTH), stages=(group_separately(NAMES),))
-    noise = estimate_curve_noise(found.responses, data)
-    return data, found, estimate_uncertainty(found.parameters, found.responses, data, PAPER, noise)
+    return data, found, estimate(found.parameters, found.responses, data)
 
 
 @pytest.mark.slow

@@ -5,7 +5,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from bars import NAMES, PAPER, TRUTH, records, simulate, storing
+from bars import NAMES, PAPER, TRUTH, estimate, records, simulate, storing
 from coverage_study import coverage_study
 
 from limbfit.identify.fit.calibration import Calibration, calibrate, move_answer
@@ -16,13 +16,12 @@ from limbfit.identify.uncertainty.intervals import (
     count_further_evaluations,
     sample_uncertainty,
 )
-from limbfit.identify.uncertainty.noise import SiteNoise, estimate_curve_noise
+from limbfit.identify.uncertainty.noise import SiteNoise
 from limbfit.identify.uncertainty.uncertainty import (
     LINEARISED,
     SAMPLED,
     WEAK,
     build_combinations,
-    estimate_uncertainty,
 )
 
 # Forces tell log c + BEND (log m)^2 well and log m itself poorly: a valley that is bent.
@@ -66,9 +65,7 @@ def test_on_a_bent_valley_the_stated_intervals_hold_the_truth():
 def estimate_near_the_truth(grouping):
     data, kept, bounds = records(0.03, seed=4), EvaluationStore(), PAPER.with_start(TRUTH)
     found = calibrate(storing(kept, simulate), data, bounds, stages=(grouping,))
-    noise = estimate_curve_noise(found.responses, data)
-    arguments = (found.parameters, found.responses, data, bounds, noise)
-    return data, kept, estimate_uncertainty(*arguments, grouping=grouping)
+    return data, kept, estimate(found.parameters, found.responses, data, bounds, grouping=grouping)
 
 
 def near_the_truth(grouping=SEPARATE):
@@ -160,8 +157,7 @@ def test_tied_parameters_have_one_interval_within_the_bounds_of_both():
     grouping = constrain(group_separately(NAMES), NAMES, tied=[["skin.m", "muscle.m"]])
     data, kept = records(0.03, seed=4), EvaluationStore()
     found = calibrate(storing(kept, simulate), data, unknowns, stages=(grouping,))
-    noise = estimate_curve_noise(found.responses, data)
-    linearised = estimate_uncertainty(found.parameters, found.responses, data, unknowns, noise, grouping)
+    linearised = estimate(found.parameters, found.responses, data, unknowns, grouping=grouping)
     for known in (linearised, sample_uncertainty(linearised, kept, simulate)):
         assert known.intervals_95[skin] == pytest.approx(known.intervals_95[muscle], rel=1e-6)
         assert np.all(known.intervals_95[skin] <= 4.8 + 1e-9)
@@ -182,9 +178,7 @@ def test_what_bounds_alone_say_of_tied_parameters_is_what_they_say_of_one():
 def test_a_parameter_that_is_given_does_not_end_on_its_bound():
     unknowns = replace(PAPER, start=np.tile([4.7, 2.0, 1.2, 2.0], 2))
     grouping = constrain(group_separately(NAMES), NAMES, fixed=["skin.m"])
-    data = records(0.03)
-    responses = simulate(unknowns.start)
-    noise = estimate_curve_noise(responses, data)
-    known = estimate_uncertainty(unknowns.start, responses, data, unknowns, noise, grouping)
+    start = unknowns.start
+    known = estimate(start, simulate(start), records(0.03), unknowns, grouping=grouping)
     at_bound = [name for name, there in zip(NAMES, known.at_bound, strict=True) if there]
     assert at_bound == ["muscle.m"]

@@ -4,7 +4,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from bars import PAPER, TRUTH, Bars
+from bars import PAPER, TRUTH, Bars, simulate_at
 
 from limbfit.identify.checks.outliers import (
     LeaveOutFits,
@@ -59,19 +59,14 @@ def study(seed: int, corruption: tuple = ("none",), fitted: int = 4):
         other = TRUTH * np.tile([2.5, 1, 1, 1], 2)
         forces[which[0]] = bars[which[0]].force(other)
     data = [MeasuredCurve(f"s{k}", force) for k, force in enumerate(forces)]
-    found = calibrate(lambda p: [bar.respond(p) for bar in bars[:fitted]], data[:fitted], PAPER)
+    found = calibrate(simulate_at(bars[:fitted]), data[:fitted], PAPER)
 
     def simulate_exchange(parameters, i, j):
         pair = at_other(bars[i], bars[j]), at_other(bars[j], bars[i])
         return tuple(bar.respond(parameters) for bar in pair)
 
-    def simulate(parameters):
-        return [bar.respond(parameters) for bar in bars]
-
-    one = np.array(found.stages[0].parameters)
-    return find_outliers(simulate, data, found.parameters, list(map(history, bars)), simulate_exchange, one)[
-        1
-    ]
+    one, histories = np.array(found.stages[0].parameters), list(map(history, bars))
+    return find_outliers(simulate_at(bars), data, found.parameters, histories, simulate_exchange, one)[1]
 
 
 def test_the_expansion_is_exact_where_only_moduli_change():
@@ -147,7 +142,7 @@ def test_cooks_distance_is_largest_where_the_fit_leans_on_a_bad_record():
     model = LogLinearModel(TRUTH, [bar.respond(TRUTH) for bar in bars])
     clean = LeaveOutFits(model, data, TRUTH).leave_one_out()
     data[3] = MeasuredCurve("s3", 1.4 * data[3].force_N)
-    found = calibrate(lambda p: [bar.respond(p) for bar in bars], data, PAPER)
+    found = calibrate(simulate_at(bars), data, PAPER)
     simulate = LogLinearModel(found.parameters, [bar.respond(found.parameters) for bar in bars])
     left = LeaveOutFits(simulate, data, found.parameters).leave_one_out()
     assert max(entry.cook for entry in clean) < 0.1 * left[3].cook

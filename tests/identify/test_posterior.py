@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from bars import NAMES, PAPER, TRUTH, records, simulate
+from bars import NAMES, PAPER, TRUTH, estimate, records, simulate
 
 from limbfit.identify.fit.objective import MeasuredCurve, SiteResponse
 from limbfit.identify.fit.parameters import Unknowns, build_space, group_by_kind, group_separately
@@ -15,9 +15,8 @@ from limbfit.identify.uncertainty.likelihood import (
     compute_profile,
     fit_alternative,
 )
-from limbfit.identify.uncertainty.noise import SiteNoise, estimate_curve_noise
+from limbfit.identify.uncertainty.noise import SiteNoise
 from limbfit.identify.uncertainty.posterior import sample_posterior
-from limbfit.identify.uncertainty.uncertainty import estimate_uncertainty
 from limbfit.results.uncertainty import ModelEvidence
 
 # A model that is linear in the logarithms, with Gaussian noise: everything has a closed form.
@@ -45,7 +44,7 @@ def linear_case(seed=0, sd=SD):
 
 def bars_case(noise=0.01, seed=4):
     data = records(noise, seed=seed)
-    u = estimate_uncertainty(TRUTH, simulate(TRUTH), data, PAPER, estimate_curve_noise(simulate(TRUTH), data))
+    u = estimate(TRUTH, simulate(TRUTH), data)
     rng = np.random.default_rng(0)
     points = TRUTH * np.exp(0.25 * rng.uniform(-1, 1, (24, 8)))
     emulator = Emulator(points, [simulate(p) for p in points])
@@ -119,7 +118,7 @@ def test_bars_all_three_intervals_agree_and_hold_the_truth():
 
 def two_models(truth, noise=0.003):
     data = records(noise, seed=6, truth=truth)
-    u = estimate_uncertainty(truth, simulate(truth), data, PAPER, estimate_curve_noise(simulate(truth), data))
+    u = estimate(truth, simulate(truth), data)
     middle = np.sqrt(truth * np.r_[truth[4:], truth[:4]])
     rng = np.random.default_rng(0)
     points = np.vstack(

@@ -4,13 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from bars import NAMES, PAPER, SITES, TRUTH, records, storing
+from bars import NAMES, PAPER, SITES, TRUTH, estimate, records, simulate_at, storing
 
 from limbfit.identify.fit.calibration import calibrate
 from limbfit.identify.fit.parameters import Prior, build_space, group_separately
 from limbfit.identify.uncertainty.intervals import EvaluationStore, sample_uncertainty
-from limbfit.identify.uncertainty.noise import estimate_curve_noise
-from limbfit.identify.uncertainty.uncertainty import PriorPrecision, estimate_uncertainty
+from limbfit.identify.uncertainty.uncertainty import PriorPrecision
 from limbfit.priors import of_tissues
 
 PEOPLE = tuple(Prior(name, *known) for name, known in of_tissues(("skin", "muscle")).items())
@@ -45,15 +44,9 @@ def test_a_parameter_that_does_not_move_has_no_share():
 
 def told(unknowns, seed=0):
     """The answer and what is known of it, as a run states it, for a draw of noise."""
-    kept, data = EvaluationStore(), records(0.03, seed=seed, sites=THIN)
-
-    def simulate(parameters):
-        return [site.respond(parameters) for site in THIN]
-
+    kept, data, simulate = EvaluationStore(), records(0.03, seed=seed, sites=THIN), simulate_at(THIN)
     found = calibrate(storing(kept, simulate), data, unknowns)
-    known = estimate_uncertainty(
-        found.parameters, found.responses, data, unknowns, estimate_curve_noise(found.responses, data)
-    )
+    known = estimate(found.parameters, found.responses, data, unknowns)
     return found, sample_uncertainty(known, kept, simulate)
 
 

@@ -4,12 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from bars import PAPER, TRUTH, records, simulate
+from bars import PAPER, TRUTH, estimate, records, simulate
 
 from limbfit.identify.fit.parameters import Prior, Unknowns
 from limbfit.identify.fit.readings import LinearisedReadings, add_scatter
-from limbfit.identify.uncertainty.noise import estimate_curve_noise
-from limbfit.identify.uncertainty.uncertainty import estimate_uncertainty
 
 AT = np.log([5.0, 2.0, 0.5])
 
@@ -65,12 +63,10 @@ def test_readings_never_widen_what_the_records_say_and_good_ones_decide_it():
     data = [
         replace(one, force_N=one.force_N + 0.003 * random.normal(size=len(one.force_N))) for one in records()
     ]
-    responses = simulate(TRUTH)
-    noise = estimate_curve_noise(responses, data)
     sd, rows = [], random.normal(size=(2, len(TRUTH)))
     for weight in (0.0, 1.0, 30.0, 1e3, 1e6):
         readings = LinearisedReadings(weight * rows, weight * rows @ np.log(TRUTH))
-        known = estimate_uncertainty(TRUTH, responses, data, replace(PAPER, readings=readings), noise)
+        known = estimate(TRUTH, simulate(TRUTH), data, replace(PAPER, readings=readings))
         sd.append(np.sqrt(np.diag(known.about_centre)))
     assert (np.diff(sd, axis=0) < 1e-12).all()
     assert (sd[3] < 0.99 * sd[0]).any()

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from bars import NAMES, PAPER, SITES, TRUTH, records
+from bars import NAMES, PAPER, SITES, TRUTH, records, simulate_at
 
 from limbfit.identify.checks.crossvalidation import average_errors, compute_site_errors
 from limbfit.identify.fit.calibration import calibrate
@@ -25,15 +25,11 @@ def region(sites, truth, fitted=None):
     measured = records(truth=truth, sites=sites)
     used = fitted or len(sites)
 
-    def simulate(parameters):
-        return [site.respond(parameters) for site in sites]
-
     def identify(start):
-        return calibrate(
-            lambda p: simulate(p)[:used], measured[:used], start, stages=(group_separately(NAMES),)
-        )
+        stages = (group_separately(NAMES),)
+        return calibrate(simulate_at(sites[:used]), measured[:used], start, stages=stages)
 
-    return identify, simulate, measured
+    return identify, simulate_at(sites), measured
 
 
 @pytest.fixture(scope="module")

@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
-from bars import NAMES, PAPER, SITES, TRUTH, Bars
+from bars import NAMES, PAPER, SITES, TRUTH, Bars, simulate_at
 
 from limbfit.bench.timing import build_punched_block
 from limbfit.fe import History, OgdenQLV, StepControl, solve
@@ -89,11 +89,7 @@ def assess(sites, forces):
         MeasuredCurve(f"s{k}", np.maximum(force + SD_N * random.standard_normal(force.size), 0.0))
         for k, force in enumerate(forces)
     ]
-
-    def simulate(p) -> list[SiteResponse]:
-        return [site.respond(p) for site in sites]
-
-    found = calibrate(simulate, data, PAPER)
+    found = calibrate(simulate_at(sites), data, PAPER)
     noise = [
         SiteNoise(f"s{k}", site.times_s, SD_N**2 * np.eye(site.points), SD_N, 0.0)
         for k, site in enumerate(sites)

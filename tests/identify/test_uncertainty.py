@@ -4,7 +4,19 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from bars import BARS, PAPER, SITES, TRUE_THREE, TRUTH, Bars, records, simulate, three_tissues
+from bars import (
+    BARS,
+    PAPER,
+    SITES,
+    TRUE_THREE,
+    TRUTH,
+    Bars,
+    estimate,
+    records,
+    simulate,
+    simulate_at,
+    three_tissues,
+)
 from scipy.linalg import block_diag
 
 from limbfit.identify.fit.calibration import calibrate
@@ -20,14 +32,13 @@ from limbfit.identify.fit.prediction import (
 )
 from limbfit.identify.uncertainty.discrepancy import ResidualModel, _RestrictedLikelihood, compute_matern
 from limbfit.identify.uncertainty.noise import estimate_curve_noise
-from limbfit.identify.uncertainty.uncertainty import DETERMINED, GIVEN, UNDETERMINED, estimate_uncertainty
+from limbfit.identify.uncertainty.uncertainty import DETERMINED, GIVEN, UNDETERMINED
 from limbfit.results.identification import RecordResiduals
 
 
 def fitted(data, run=simulate):
     found = calibrate(run, data, PAPER)
-    noise = estimate_curve_noise(found.responses, data)
-    return found, estimate_uncertainty(found.parameters, found.responses, data, PAPER, noise)
+    return found, estimate(found.parameters, found.responses, data)
 
 
 def linear_fit(data, truth=TRUTH, sites=SITES, unknowns=PAPER, mesh_N=(), site_N=()):
@@ -37,10 +48,7 @@ def linear_fit(data, truth=TRUTH, sites=SITES, unknowns=PAPER, mesh_N=(), site_N
     r = np.concatenate([(r.force_N - d.force_N) * d.scale for r, d in zip(responses, data)])
     step = np.linalg.lstsq(J, -r, rcond=None)[0]
     moved = [type(r)(r.force_N + r.jacobian @ (truth * step), r.jacobian) for r in responses]
-    found = estimate_uncertainty(
-        truth, moved, data, unknowns, estimate_curve_noise(moved, data), mesh_N=mesh_N, site_N=site_N
-    )
-    return step, found
+    return step, estimate(truth, moved, data, unknowns, mesh_N=mesh_N, site_N=site_N)
 
 
 def coverage(noise_of, repeats=100, truth=TRUTH, sites=SITES, unknowns=PAPER, stiffer=0.0, expected=0.0):
@@ -165,13 +173,9 @@ def test_records_of_a_site_share_the_error_of_its_mesh():
     twice = [replace(d, name=f"{d.name}-2", site=d.name) for d in records()]
     noisy = [replace(d, force_N=d.force_N + n) for d, n in zip([*records(), *twice], 2 * scatter(0.01))]
     responses = 2 * simulate(TRUTH)
-    noise = estimate_curve_noise(responses, noisy)
-    one = estimate_uncertainty(TRUTH, responses[:4], noisy[:4], PAPER, noise[:4], mesh_N=mesh)
-    both = estimate_uncertainty(TRUTH, responses, noisy, PAPER, noise, mesh_N=2 * mesh)
-    alone = [replace(d, site="") for d in noisy]
-    apart = estimate_uncertainty(
-        TRUTH, responses, alone, PAPER, estimate_curve_noise(responses, alone), mesh_N=2 * mesh
-    )
+    one = estimate(TRUTH, responses[:4], noisy[:4], mesh_N=mesh)
+    both = estimate(TRUTH, responses, noisy, mesh_N=2 * mesh)
+    apart = estimate(TRUTH, responses, [replace(d, site="") for d in noisy], mesh_N=2 * mesh)
     stiffness = np.eye(8)[0] + np.eye(8)[4]  # both moduli, which the mesh moves
 
     def sd(found):
@@ -309,9 +313,7 @@ def test_two_tissues_that_cannot_be_told_apart_are_correlated():
 
 def test_what_is_given_is_not_called_identified():
     data, grouping = records(0.01), (0, 1, 2, -1, 3, 4, 5, -1)
-    u = estimate_uncertainty(
-        TRUTH, simulate(TRUTH), data, PAPER, estimate_curve_noise(simulate(TRUTH), data), grouping=grouping
-    )
+    u = estimate(TRUTH, simulate(TRUTH), data, grouping=grouping)
     assert u.verdicts[3] == u.verdicts[7] == GIVEN
     assert u.covariance[3, 3] == 0
     assert len(u.combinations) == 6
@@ -320,39 +322,28 @@ def test_what_is_given_is_not_called_identified():
 def test_an_answer_on_its_bound_is_flagged():
     upper = PAPER.upper.copy()
     upper[0] = 6.0
-    bounded = type(PAPER)(PAPER.names, PAPER.start, PAPER.lower, upper)
-    data = records(0.01)
+    bounded, data = replace(PAPER, upper=upper), records(0.01)
     found = calibrate(simulate, data, bounded)
-    u = estimate_uncertainty(
-        found.parameters, found.responses, data, bounded, estimate_curve_noise(found.responses, data)
-    )
+    u = estimate(found.parameters, found.responses, data, bounded)
     assert u.at_bound == (True,) + (False,) * 7
     assert u.intervals_95[0, 1] <= 6.0
 
 
 def test_a_perfect_fit_is_no_division_by_zero():
-    data = records()
-    u = estimate_uncertainty(TRUTH, simulate(TRUTH), data, PAPER, estimate_curve_noise(simulate(TRUTH), data))
+    u = estimate(TRUTH, simulate(TRUTH), records())
     assert np.all(np.isfinite(u.covariance))
     assert set(u.verdicts) == {DETERMINED}
 
 
 def test_prediction_intervals_match_the_spread_of_predictions():
-    held_out = SITES[1]
-    forces, predicted = [], None
+    held_out, rest = SITES[1], [SITES[k] for k in (0, 2, 3)]
+    forces, predicted, stages = [], None, (group_separately(PAPER.names),)
     for seed in range(30):
-        rest = [SITES[k] for k in (0, 2, 3)]
         data = records(0.03, seed=seed, sites=rest)
-        found = calibrate(
-            lambda p: [s.respond(p) for s in rest],  # noqa: B023
-            data,
-            type(PAPER)(PAPER.names, TRUTH, PAPER.lower, PAPER.upper),
-            stages=(group_separately(PAPER.names),),
-        )
+        found = calibrate(simulate_at(rest), data, PAPER.with_start(TRUTH), stages=stages)
         forces.append(held_out.force(found.parameters))
         if seed == 0:
-            noise = estimate_curve_noise(found.responses, data)
-            u = estimate_uncertainty(found.parameters, found.responses, data, PAPER, noise)
+            u = estimate(found.parameters, found.responses, data)
             response, known = (
                 held_out.respond(found.parameters),
                 (u.covariance, found.parameters, {}, 0.0, 1e6),

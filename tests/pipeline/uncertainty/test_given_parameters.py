@@ -13,7 +13,7 @@ from completing import complete
 from layered import block_context, block_study
 
 sys.path.append(str(Path(__file__).parents[2] / "identify"))
-from bars import PAPER, TRUTH, records, simulate
+from bars import PAPER, TRUTH, estimate, records, simulate
 
 from limbfit.identify.fit.objective import SiteResponse
 from limbfit.identify.fit.parameters import build_space
@@ -21,7 +21,7 @@ from limbfit.identify.fit.prediction import RelaxationSpread
 from limbfit.identify.uncertainty.emulator import Emulator
 from limbfit.identify.uncertainty.likelihood import Likelihood
 from limbfit.identify.uncertainty.noise import estimate_curve_noise
-from limbfit.identify.uncertainty.uncertainty import ResidualModel, estimate_uncertainty
+from limbfit.identify.uncertainty.uncertainty import ResidualModel
 from limbfit.pipeline.engine.context import Context
 from limbfit.pipeline.engine.store import Store
 from limbfit.pipeline.identification.search import build_problem
@@ -87,8 +87,7 @@ def test_one_material_keeps_what_the_study_fixes_and_is_judged_at_each_site_once
         file.write_text(json.dumps(complete(model, content)))
     problem, data = build_problem(study), records(0.01)
     unknowns = PAPER.with_start(TRUTH)
-    noise = estimate_curve_noise(simulate(TRUTH), data)
-    known = estimate_uncertainty(TRUTH, simulate(TRUTH), data, unknowns, noise, problem.stages[-1])
+    known = estimate(TRUTH, simulate(TRUTH), data, unknowns, grouping=problem.stages[-1])
     space = build_space(unknowns, problem.stages[-1])
     shifts = 0.2 * np.random.default_rng(0).uniform(-1, 1, (16, len(space.lower)))
     points = [space.expand(space.reduce(np.log(TRUTH)) + shift) for shift in shifts]
@@ -133,8 +132,7 @@ def test_intervals_of_predictions_widen_beyond_the_longest_load_as_those_of_a_ru
 
 
 def test_verdicts_count_relaxation_beyond_the_records_as_those_of_a_run():
-    data, responses = records(0.01), simulate(TRUTH)
-    known = estimate_uncertainty(TRUTH, responses, data, PAPER, estimate_curve_noise(responses, data))
+    known = estimate(TRUTH, simulate(TRUTH), records(0.01))
     posterior = SimpleNamespace(
         covariance=1e-4 * np.eye(8),
         median=TRUTH,
@@ -161,9 +159,7 @@ def test_verdicts_count_relaxation_beyond_the_records_as_those_of_a_run():
 def test_an_interval_covers_what_is_most_probable_beside_the_answer(tmp_path):
     data, response = records(0.01)[0], simulate(TRUTH)[0]
     (noise, *_) = estimate_curve_noise([response], [data])
-    known = estimate_uncertainty(
-        TRUTH, simulate(TRUTH), records(0.01), PAPER, estimate_curve_noise(simulate(TRUTH), records(0.01))
-    )
+    known = estimate(TRUTH, simulate(TRUTH), records(0.01))
     likely = TRUTH * np.exp(0.3)
     posterior = SimpleNamespace(covariance=1e-6 * np.eye(len(TRUTH)), median=likely)
     found = SimpleNamespace(
