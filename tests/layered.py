@@ -1,6 +1,6 @@
 """Blocks of layered tissue under a square punch as sites of a study: real solving without the mesher."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -131,16 +131,27 @@ def box(sides: tuple[float, float], height: tuple[float, float]) -> Surface:
     return Surface(points, np.array([t for a, b, c, d in squares for t in ((a, b, c), (a, c, d))]))
 
 
+def write_ramps(study: Study, model: SiteModel, truth: Parameters, random: np.random.Generator) -> None:
+    """What a robot writes down of the true forces."""
+    times = np.linspace(0.0, model.knots_s[-1], 201)
+    job = SimulationJob(model, study.tissues, tuple(study.vector(truth)), tuple(times), False)
+    force = simulate(job).force_N
+    made = record(Ramp(max(model.knots_mm), 0.96), lambda t: np.interp(t, times, force), random)
+    made.write(study.path(Path(f"{model.name}.csv")))
+
+
 def store_blocks(
     study: Study,
     blocks: Mapping[str, tuple[Sequence[float], float, bool]],
     truth: Parameters,
     divisions: int,
     coarse: int | None = None,
+    write: Callable[[Study, SiteModel, Parameters, np.random.Generator], None] = write_ramps,
 ) -> Store:
     """Surfaces, places, noisy records and meshes of blocks, as their stages store them.
 
     ``blocks``: thickness of each tissue, depth, whether fitted.  ``coarse``: divisions of a second mesh.
+    ``write`` writes the records of a site.
     """
     store, tissues = Store(study.results), study.tissues
     for stage in ("sites", "traces", "mesh"):
@@ -168,7 +179,7 @@ def store_blocks(
         model = replace(model, course=study.material.course)
         model = replace(model, relaxation_span_s=study.material.relaxation_span_s)
         model = replace(model, fibres=find_fibre_directions(study, store.results))
-        _write_record(study, model, truth, np.random.default_rng(i))
+        write(study, model, truth, np.random.default_rng(i))
         places.append(
             {"site": name, "region": "", "fitted": fitted, "position_mm": [0.0] * 3, "axis": [0.0, 0.0, -1.0]}
             | {"off_skin_mm": 0.0, "marker": None}
@@ -189,12 +200,3 @@ def check_derivative(job: SimulationJob, found: Simulation, step: Array, share: 
     change = (ahead - back) / 2.0
     assert found.jacobian is not None
     np.testing.assert_allclose(found.jacobian @ step, change, atol=share * np.abs(change).max())
-
-
-def _write_record(study: Study, model: SiteModel, truth: Parameters, random: np.random.Generator) -> None:
-    """What a robot writes down of the true forces."""
-    times = np.linspace(0.0, model.knots_s[-1], 201)
-    job = SimulationJob(model, study.tissues, tuple(study.vector(truth)), tuple(times), False)
-    force = simulate(job).force_N
-    made = record(Ramp(max(model.knots_mm), 0.96), lambda t: np.interp(t, times, force), random)
-    made.write(study.path(Path(f"{model.name}.csv")))

@@ -5,9 +5,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-import pytest
 
-import layered
 from layered import layered_block, store_blocks
 from limbfit.execution import SerialExecutor
 from limbfit.identify.uncertainty.uncertainty import Uncertainty
@@ -20,6 +18,8 @@ from limbfit.pipeline.identification.answer import (
     correct_to_fine_meshes,
     estimate_linearised,
 )
+from limbfit.pipeline.identification.calibrate import run_calibrate
+from limbfit.pipeline.identification.predict import run_predict
 from limbfit.pipeline.identification.search import RecordSimulator, build_problem
 from limbfit.pipeline.records.records import RecordSet, load_records
 from limbfit.pipeline.simulation.simulations import SimulationCache
@@ -83,7 +83,7 @@ class SeenBlock:
         (folder / "study.toml").write_text(TEXT.format(self.tools) + more)
         return load_study(folder)
 
-    def stored(self, folder: Path, monkeypatch: pytest.MonkeyPatch, more: str) -> Context:
+    def stored(self, folder: Path, more: str) -> Context:
         """A study with ``more`` said of its site, and what the stages before a calibration make."""
         mesh = self.mesh()
 
@@ -98,12 +98,61 @@ class SeenBlock:
             made.write(study.path(Path("a.csv")))
             self.write(study, model, found, (made, times, random))
 
-        monkeypatch.setattr(layered, "_write_record", write)
         study, n = self.study(folder, more), self.divisions
-        store = store_blocks(study, {"a": (self.thickness, 3.0, True)}, TRUTH, n, coarse=n)
+        store = store_blocks(study, {"a": (self.thickness, 3.0, True)}, TRUTH, n, n, write)
         for place in (store["mesh"], store["mesh"] / "coarse"):
             write_vtu(mesh, place / "a.vtu")
         return Context(study, store, SerialExecutor(), lambda event: None)
+
+    def narrowed(self, folder: Path, more: str) -> "Narrowed":
+        """What one ramp and ``more`` beside it tell: every interval is narrower than by force alone."""
+        widths = []
+        for name, said in (("force", ""), ("both", more)):
+            (folder / name).mkdir()
+            context = self.stored(folder / name, said)
+            records, at, known = estimate_at_truth(context)
+            widths.append(np.log(known.intervals_95[:, 1] / known.intervals_95[:, 0]))
+        assert (widths[1] < widths[0]).all()
+        assert {one.site_name for one in records.curves} == {"a"}  # left out together
+        assert records.simulations == 1
+        noise = known.residual_model.noise
+        misfits = []
+        for one, response, seen in zip(records.own[1:], at.responses[1:], noise[1:], strict=True):
+            off = response.force_N - one.compared
+            misfits.append(off @ np.linalg.solve(seen.covariance, off) / len(off))
+        return Narrowed(context, records, misfits, widths[0], widths[1])
+
+
+@dataclass(frozen=True)
+class Narrowed:
+    """What is known of a block at its true parameters, and how well what is seen beside the force fits.
+
+    ``misfits`` are mean squares in the noise's own measure; ``by_force`` and ``by_both`` the logarithms of
+    the ratios of the intervals' ends.
+    """
+
+    context: Context
+    records: RecordSet
+    misfits: list[float]
+    by_force: np.ndarray
+    by_both: np.ndarray
+
+    def fit_and_predict(self) -> tuple[dict, list[dict]]:
+        """The calibration's result, and what is predicted of each curve that is seen beside the force."""
+        store = self.context.store
+        for stage, run in (("calibrate", run_calibrate), ("predict", run_predict)):
+            store[stage].mkdir()
+            run(self.context, store[stage])
+        (row,) = store.results.predict.to_plain()["sites"]
+        return store.results.calibration.to_plain(), row["observed"]
+
+
+def check_truth_within(intervals: dict) -> None:
+    """Every true value lies within the 95 % interval of a calibration."""
+    for tissue, values in TRUTH.items():
+        for name, value in values.items():
+            low, high = intervals[tissue][name]
+            assert low <= value <= high, (tissue, name)
 
 
 def estimate_at_truth(context: Context) -> tuple[RecordSet, FineMeshCorrection, Uncertainty]:

@@ -6,20 +6,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from layered import build_block_site, layered_block
+from layered import blocks_study, store_blocks
 from limbfit import check_study, load_study
 from limbfit.execution import SerialExecutor
-from limbfit.indentation import SimulationJob, simulate, to_vector
+from limbfit.indentation import SimulationJob, simulate
 from limbfit.pipeline.engine.context import Context
-from limbfit.pipeline.engine.store import Store, write_json
 from limbfit.pipeline.records.records import estimate_site_noise, load_site_record
-from limbfit.pipeline.records.traces import run_traces
 from limbfit.pipeline.simulation.simulations import CURVE_POINTS
 from limbfit.report.page import Table
 from limbfit.report.sections.inputs import draw_record_figure, make_record_section
 from limbfit.report.store import load_store
 
-TISSUES = ("skin", "muscle")
 TRUTH = {
     "skin": {"c_kPa": 9.0, "m": 6.0, "gamma": 2.0, "tau_s": 0.6},
     "muscle": {"c_kPa": 4.5, "m": 4.5, "gamma": 3.0, "tau_s": 0.3},
@@ -48,12 +45,6 @@ load_steps = 5
 unload_steps = 8
 penalty_per_mm = 100.0
 """
-SITE = """
-[[sites]]
-name = "{name}"
-trace = "{name}.csv"
-position = [0.0, 0.0, 0.0]
-"""
 
 
 def write_record(file: Path, knots_s, knots_mm, force, slack_mm=0.36, slack_s=0.3, step_s=0.004) -> None:
@@ -80,29 +71,20 @@ def write_record(file: Path, knots_s, knots_mm, force, slack_mm=0.36, slack_s=0.
 @pytest.mark.parametrize("name", ["cycles", pytest.param("held", marks=pytest.mark.slow)])
 def test_a_protocol_goes_from_its_record_to_residuals_and_report(tmp_path, name):
     knots_s, knots_mm, words = PROTOCOLS[name]
-    (tmp_path / "study.toml").write_text(TEXT + SITE.format(name=name), encoding="utf-8")
-    (tmp_path / "skin.stl").touch()
-    (tmp_path / f"{name}.csv").touch()
-    study = load_study(tmp_path)
-    store = Store(study.results)
-    for stage in ("sites", "traces", "mesh"):
-        store[stage].mkdir(parents=True)
-    mesh = layered_block((3.0, 11.0), TISSUES, divisions=4)
-    model = build_block_site(name, store["mesh"] / f"{name}.vtu", mesh, 3.0, study.solver)
-    own = {"indenter": study.indenter, "element": study.mesh.element}
-    model = replace(model, knots_s=knots_s, knots_mm=knots_mm, **own)
-    truth = tuple(to_vector(TRUTH, TISSUES))
-    times = model.curve_times(400)
-    found = simulate(SimulationJob(model, TISSUES, truth, tuple(times), False))
-    assert found.completed
-    write_record(
-        study.path(Path(f"{name}.csv")), knots_s, knots_mm, lambda t: np.interp(t, times, found.force_N)
-    )
-    place = {"site": name, "region": "", "fitted": True, "position_mm": [0.0] * 3, "axis": [0.0, 0.0, -1.0]}
-    write_json(store["sites"] / "sites.json", {"sites": [place | {"off_skin_mm": 0.0, "marker": None}]})
-    context = Context(study, store, SerialExecutor(), lambda event: None)
+    study = blocks_study(tmp_path, TEXT, {name: True})
+    truth = tuple(study.vector(TRUTH))
 
-    run_traces(context, store["traces"])
+    def write(study, model, *given) -> None:
+        model = replace(model, knots_s=knots_s, knots_mm=knots_mm)
+        times = model.curve_times(400)
+        found = simulate(SimulationJob(model, study.tissues, truth, tuple(times), False))
+        assert found.completed
+        write_record(
+            study.path(Path(f"{name}.csv")), knots_s, knots_mm, lambda t: np.interp(t, times, found.force_N)
+        )
+
+    store = store_blocks(study, {name: ((3.0, 11.0), 3.0, True)}, TRUTH, 4, write=write)
+    context = Context(study, store, SerialExecutor(), lambda event: None)
     facts = store.results.traces.to_plain()["sites"][name]
     assert facts["phases_in_words"] == words
     assert facts["phases"][0]["kind"] == "approach"

@@ -6,24 +6,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from seen_blocks import TRUTH, estimate_at_truth
 
-import layered
-from layered import build_block_site, layered_block, store_blocks
+from layered import layered_block, store_blocks
 from limbfit.execution import SerialExecutor
-from limbfit.indentation import SimulationJob, SiteModel, simulate
+from limbfit.indentation import Parameters, SimulationJob, SiteModel, simulate
 from limbfit.mesh import write_vtu
-from limbfit.pipeline.engine.context import Context, Progress
+from limbfit.pipeline.engine.context import Context
 from limbfit.pipeline.engine.store import COARSE
-from limbfit.pipeline.identification.answer import correct_to_fine_meshes, estimate_linearised
-from limbfit.pipeline.identification.search import RecordSimulator, build_problem
-from limbfit.pipeline.records.records import load_records, load_site_record, to_response
-from limbfit.pipeline.simulation.simulations import SimulationCache
+from limbfit.pipeline.records.records import load_site_record, to_response
 from limbfit.study import Record, Study, load_study
 
-TRUTH = {
-    "skin": {"c_kPa": 9.0, "m": 6.0, "gamma": 2.0, "tau_s": 0.6},
-    "muscle": {"c_kPa": 4.5, "m": 4.5, "gamma": 3.0, "tau_s": 0.3},
-}
 LAYERS = (3.0, 9.0)
 STUDY = """
 [study]
@@ -73,8 +66,13 @@ HISTORIES = {
 }
 
 
-def quiet(event: Progress) -> None:
-    """A listener that does nothing."""
+def write_records(study: Study, block: SiteModel, truth: Parameters, random: np.random.Generator) -> None:
+    """Those of a study whose block is meshed as its tissue is."""
+    mesh = layered_block(LAYERS, study.tissues, 12.0, 6, 3.0)
+    for place in (block.mesh, block.mesh.parent / COARSE / "a.vtu"):
+        write_vtu(mesh, place)
+    for i, record in enumerate(study.recorded):
+        write_record(study, record, block, np.random.default_rng(i))
 
 
 def write_record(study: Study, record: Record, base: SiteModel, random: np.random.Generator) -> None:
@@ -108,37 +106,21 @@ def stored(folder: Path, text: str) -> Context:
         (folder / name).touch()
     (folder / "study.toml").write_text(text)
     study = load_study(folder)
-    truth = layered_block(LAYERS, study.tissues, 12.0, 6, 3.0)
-    base = build_block_site("a", folder / "truth.vtu", truth, 3.0, study.solver)
-    base = replace(base, element=study.mesh.element)
-    for i, record in enumerate(study.recorded):
-        write_record(study, record, base, np.random.default_rng(i))
-    store = store_blocks(study, {"a": (LAYERS, 3.0, True)}, TRUTH, 4, coarse=4)
-    for place in (store["mesh"], store["mesh"] / COARSE):
-        write_vtu(layered_block(LAYERS, study.tissues, 12.0, 6, 3.0), place / "a.vtu")
-    return Context(study, store, SerialExecutor(), quiet)
-
-
-@pytest.fixture
-def no_own_record(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Records are those that this file writes."""
-    monkeypatch.setattr(layered, "_write_record", lambda *given: None)
+    store = store_blocks(study, {"a": (LAYERS, 3.0, True)}, TRUTH, 4, coarse=4, write=write_records)
+    return Context(study, store, SerialExecutor(), lambda event: None)
 
 
 @pytest.mark.slow
-def test_further_records_narrow_every_interval(tmp_path: Path, no_own_record: None) -> None:
+def test_further_records_narrow_every_interval(tmp_path: Path) -> None:
     """At the true parameters: what the records determine of them, and no residual where nothing is wrong."""
     known = []
     for name, text in (("ramp", STUDY), ("all", STUDY + FURTHER)):
         (tmp_path / name).mkdir()
         context = stored(tmp_path / name, text)
-        study, cache = context.study, SimulationCache(tmp_path / name / "runs")
-        records = load_records(context, study.records_at(*study.fitted), secondary=True)
-        simulator = RecordSimulator(build_problem(study), records, cache, context.executor, lambda text: None)
-        at = correct_to_fine_meshes(simulator, study.vector(TRUTH))
+        records, at, found = estimate_at_truth(context)
         for record, response in zip(records.own, at.responses, strict=True):
             assert np.abs(response.force_N - record.compared).mean() < 0.04 * record.compared.max()
-        known.append(estimate_linearised(simulator, study.vector(TRUTH), at))
+        known.append(found)
     every = known[1]
     assert {noise.name: noise.unit for noise in every.residual_model.noise} == {
         name: "mm" if name == "a-creep" else "N" for name in HISTORIES
@@ -148,7 +130,7 @@ def test_further_records_narrow_every_interval(tmp_path: Path, no_own_record: No
 
 
 @pytest.mark.slow
-def test_depths_under_a_force_follow_the_parameters(tmp_path: Path, no_own_record: None) -> None:
+def test_depths_under_a_force_follow_the_parameters(tmp_path: Path) -> None:
     """The derivatives that a creep is fitted with, in the units of the study, beside differences."""
     text = STUDY.replace("load_steps = 10", "load_steps = 3").replace("unload_steps = 10", "unload_steps = 3")
     context = stored(tmp_path, text.replace('"a.csv"', '"a-creep.csv"\ncontrol = "force"'))

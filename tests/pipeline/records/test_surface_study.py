@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.interpolate import interp1d
-from seen_blocks import TRUTH, Made, SeenBlock, estimate_at_truth
+from seen_blocks import Made, SeenBlock, check_truth_within, estimate_at_truth
 
 from limbfit.errors import TraceError
 from limbfit.indentation import (
@@ -17,8 +17,6 @@ from limbfit.indentation import (
 )
 from limbfit.mesh import Mesh
 from limbfit.phantom.robot import write_surface
-from limbfit.pipeline.identification.calibrate import run_calibrate
-from limbfit.pipeline.identification.predict import run_predict
 from limbfit.pipeline.records.secondary_measurements import MAX_POINTS, ChosenPoints, choose_points
 from limbfit.pipeline.records.traces import run_traces
 from limbfit.report.drawing.figures import draw_seen_figures
@@ -64,47 +62,29 @@ BLOCK = SeenBlock((3.0, 12.0), 24.0, 4.0, 6, TOOLS, "a-surface.csv", with_points
 
 
 @pytest.mark.slow
-def test_what_cameras_see_is_fitted_and_predicted(tmp_path: Path, monkeypatch) -> None:
+def test_what_cameras_see_is_fitted_and_predicted(tmp_path: Path) -> None:
     """Beside one ramp: nothing is off at the truth, and every interval is narrower than by force alone.
 
     The skin's modulus is determined, which it is not by force; the true values lie within the intervals of
     the calibration.
     """
-    widths = []
-    for name, more in (("force", ""), ("both", SEEN)):
-        (tmp_path / name).mkdir()
-        context = BLOCK.stored(tmp_path / name, monkeypatch, more)
-        records, at, known = estimate_at_truth(context)
-        widths.append(np.sqrt(known.intervals_95[:, 1] / known.intervals_95[:, 0]))
-    assert [one.name for one in records.own] == ["a", "a+surface"]
-    assert [one.unit for one in records.curves] == ["N", "mm"]
-    assert {one.site_name for one in records.curves} == {"a"}  # left out together
-    seen, noise = records.own[1], known.residual_model.noise[1]
-    off = at.responses[1].force_N - seen.compared
-    assert len(off) > 300
-    assert off @ np.linalg.solve(noise.covariance, off) / len(off) == pytest.approx(1.0, abs=0.25)
-    assert records.simulations == 1
-    assert (widths[1] < widths[0]).all()
-    assert widths[0][0] > 2.0  # force alone: 2.6 for the skin's modulus, 1.7 for the muscle's
-    assert widths[1][0] < 1.5  # 1.45
-    assert widths[1][4] < 1.2  # 1.09
-    for stage, run in (("calibrate", run_calibrate), ("predict", run_predict)):
-        context.store[stage].mkdir()
-        run(context, context.store[stage])
-    found = context.store.results.calibration.to_plain()
+    known = BLOCK.narrowed(tmp_path, SEEN)
+    assert [one.name for one in known.records.own] == ["a", "a+surface"]
+    assert [one.unit for one in known.records.curves] == ["N", "mm"]
+    assert len(known.records.own[1].compared) > 300
+    assert known.misfits == pytest.approx([1.0], abs=0.25)
+    by_force, by_both = np.exp(known.by_force / 2.0), np.exp(known.by_both / 2.0)
+    assert by_force[0] > 2.0  # force alone: 2.6 for the skin's modulus, 1.7 for the muscle's
+    assert by_both[0] < 1.5  # 1.45
+    assert by_both[4] < 1.2  # 1.09
+    found, (surface,) = known.fit_and_predict()
     assert list(found["contact"]) == ["a"]
     assert found["uncertainty"]["residuals"]["sites"]["a+surface"]["unit"] == "mm"
-    intervals = found["uncertainty"]["intervals_95"]
-    for tissue, values in TRUTH.items():
-        for name, value in values.items():
-            low, high = intervals[tissue][name]
-            assert low <= value <= high, (tissue, name)
-    (row,) = context.store.results.predict.to_plain()["sites"]
-    (surface,) = row["observed"]
+    check_truth_within(found["uncertainty"]["intervals_95"])
     assert (surface["kind"], surface["left_out"]) == ("surface", {})
     assert surface["compared"].startswith("24 points, ")
     assert surface["error_percent"] < 10.0
-    results = load_store(context.study.results)
+    results = load_store(known.context.study.results)
     figure, shown = draw_seen_figures(results, fitted=True)[2], make_observed_table(results)
     assert figure is not None
     assert "a: " in figure.markup
@@ -113,9 +93,9 @@ def test_what_cameras_see_is_fitted_and_predicted(tmp_path: Path, monkeypatch) -
 
 
 @pytest.mark.slow
-def test_one_component_in_the_frame_of_the_indenter(tmp_path: Path, monkeypatch) -> None:
+def test_one_component_in_the_frame_of_the_indenter(tmp_path: Path) -> None:
     """The same points and the same moves, along the axis alone."""
-    context = BLOCK.stored(tmp_path, monkeypatch, SEEN + 'surface_frame = "site"\nedge = [0.0, 1.0, 0.0]\n')
+    context = BLOCK.stored(tmp_path, SEEN + 'surface_frame = "site"\nedge = [0.0, 1.0, 0.0]\n')
     file = context.study.path(Path("a-surface.csv"))
     rows = np.loadtxt(file, delimiter=",", skiprows=1)
     np.savetxt(

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from seen_blocks import PUNCH, Made, SeenBlock, estimate_at_truth
+from seen_blocks import PUNCH, Made, SeenBlock
 
 import layered
 from layered import build_block_site, layered_block
@@ -14,8 +14,6 @@ from limbfit.errors import ProblemError, TraceError
 from limbfit.indentation import Simulation, SimulationJob, SiteModel, simulate, to_vector
 from limbfit.mesh import find_gauges_along
 from limbfit.phantom.robot import write_ultrasound
-from limbfit.pipeline.identification.calibrate import run_calibrate
-from limbfit.pipeline.identification.predict import run_predict
 from limbfit.report.drawing.figures import draw_seen_figures
 from limbfit.report.store import load_store
 from limbfit.study import SolverTable, Study
@@ -153,36 +151,21 @@ BLOCK = SeenBlock(
 
 
 @pytest.mark.slow
-def test_what_ultrasound_sees_is_fitted_and_predicted(tmp_path: Path, monkeypatch) -> None:
+def test_what_ultrasound_sees_is_fitted_and_predicted(tmp_path: Path) -> None:
     """Beside one ramp: nothing is off at the truth, and every interval is narrower than by force alone."""
-    widths = []
-    for name, more in (("force", ""), ("both", 'ultrasound = "a-layers.csv"\n')):
-        (tmp_path / name).mkdir()
-        context = BLOCK.stored(tmp_path / name, monkeypatch, more)
-        records, at, known = estimate_at_truth(context)
-        widths.append(np.log(known.intervals_95[:, 1] / known.intervals_95[:, 0]))
-    assert [one.name for one in records.own] == ["a", "a+skin", "a+muscle"]
-    assert [one.unit for one in records.curves] == ["N", "mm", "mm"]
-    for one, response, noise in zip(
-        records.own[1:], at.responses[1:], known.residual_model.noise[1:], strict=True
-    ):
-        off = response.force_N - one.compared
-        assert off @ np.linalg.solve(noise.covariance, off) / len(off) < 2.0
-    assert records.simulations == 1
-    assert (widths[1] < widths[0]).all()
-    for stage, run in (("calibrate", run_calibrate), ("predict", run_predict)):
-        context.store[stage].mkdir()
-        run(context, context.store[stage])
-    found = context.store.results.calibration.to_plain()
+    known = BLOCK.narrowed(tmp_path, 'ultrasound = "a-layers.csv"\n')
+    assert [one.name for one in known.records.own] == ["a", "a+skin", "a+muscle"]
+    assert [one.unit for one in known.records.curves] == ["N", "mm", "mm"]
+    assert max(known.misfits) < 2.0
+    found, observed = known.fit_and_predict()
     assert list(found["contact"]) == ["a"]
     assert found["uncertainty"]["residuals"]["sites"]["a+muscle"]["unit"] == "mm"
     last = found["stages"][-1]["iterations"][-1]
     assert list(last["error_percent_by_site"]) == ["a", "a+skin", "a+muscle"]
-    (row,) = context.store.results.predict.to_plain()["sites"]
-    assert {one["what"]: one["thickness_mm"] for one in row["observed"]} == pytest.approx(
+    assert {one["what"]: one["thickness_mm"] for one in observed} == pytest.approx(
         {"skin": 3.0, "muscle": 9.0}, abs=0.1
     )
-    assert (context.store["predict"] / "a+muscle.csv").is_file()
-    figure = draw_seen_figures(load_store(context.study.results), fitted=True)[0]
+    assert (known.context.store["predict"] / "a+muscle.csv").is_file()
+    figure = draw_seen_figures(load_store(known.context.study.results), fitted=True)[0]
     assert figure is not None
     assert "a, muscle" in figure.markup

@@ -5,14 +5,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from seen_blocks import PUNCH, TRUTH, Made, SeenBlock, estimate_at_truth
+from seen_blocks import PUNCH, Made, SeenBlock, check_truth_within
 
 from limbfit.errors import TraceError
 from limbfit.indentation import Simulation, SiteModel, place_waves_under
 from limbfit.phantom.robot import write_waves
 from limbfit.pipeline.engine.context import Context
-from limbfit.pipeline.identification.calibrate import run_calibrate
-from limbfit.pipeline.identification.predict import run_predict
 from limbfit.pipeline.records.records import build_model
 from limbfit.pipeline.records.traces import run_traces
 from limbfit.report.drawing.figures import draw_seen_figures
@@ -45,42 +43,21 @@ BLOCK = SeenBlock(
 
 
 @pytest.mark.slow
-def test_speeds_are_fitted_and_predicted(tmp_path: Path, monkeypatch) -> None:
+def test_speeds_are_fitted_and_predicted(tmp_path: Path) -> None:
     """Beside one ramp: nothing is off at the truth, every interval is narrower than by force alone, and the
     moduli of both tissues are known several times as well."""
-    widths = []
-    for name, more in (("force", ""), ("both", WAVES)):
-        (tmp_path / name).mkdir()
-        context = BLOCK.stored(tmp_path / name, monkeypatch, more)
-        records, at, known = estimate_at_truth(context)
-        widths.append(np.log(known.intervals_95[:, 1] / known.intervals_95[:, 0]))
-    assert [one.name for one in records.own] == ["a", "a+skin-waves", "a+muscle-waves"]
-    assert [one.unit for one in records.curves] == ["N", "m/s", "m/s"]
-    assert {one.site_name for one in records.curves} == {"a"}
-    for one, response, noise in zip(
-        records.own[1:], at.responses[1:], known.residual_model.noise[1:], strict=True
-    ):
-        off = response.force_N - one.compared
-        assert off @ np.linalg.solve(noise.covariance, off) / len(off) < 2.5
-    assert records.simulations == 1
-    assert (widths[1] < widths[0]).all()
-    assert (widths[1][[0, 4]] < 0.6 * widths[0][[0, 4]]).all()
-    for stage, run in (("calibrate", run_calibrate), ("predict", run_predict)):
-        context.store[stage].mkdir()
-        run(context, context.store[stage])
-    found = context.store.results.calibration.to_plain()
+    known = BLOCK.narrowed(tmp_path, WAVES)
+    assert [one.name for one in known.records.own] == ["a", "a+skin-waves", "a+muscle-waves"]
+    assert [one.unit for one in known.records.curves] == ["N", "m/s", "m/s"]
+    assert max(known.misfits) < 2.5
+    assert (known.by_both[[0, 4]] < 0.6 * known.by_force[[0, 4]]).all()
+    found, (skin, muscle) = known.fit_and_predict()
     assert found["uncertainty"]["residuals"]["sites"]["a+muscle-waves"]["unit"] == "m/s"
-    intervals = found["uncertainty"]["intervals_95"]
-    for tissue, values in TRUTH.items():
-        for name, value in values.items():
-            low, high = intervals[tissue][name]
-            assert low <= value <= high, (tissue, name)
-    (row,) = context.store.results.predict.to_plain()["sites"]
-    skin, muscle = row["observed"]
+    check_truth_within(found["uncertainty"]["intervals_95"])
     assert (skin["kind"], skin["unit"], skin["what"]) == ("shear waves", "m/s", "skin-waves")
     assert muscle["error_percent"] < 10.0
-    assert (context.store["predict"] / "a+muscle-waves.csv").is_file()
-    results = load_store(context.study.results)
+    assert (known.context.store["predict"] / "a+muscle-waves.csv").is_file()
+    results = load_store(known.context.study.results)
     figure, shown = draw_seen_figures(results, fitted=True)[1], make_observed_table(results)
     assert figure is not None
     assert "a, skin-waves" in figure.markup
@@ -88,10 +65,10 @@ def test_speeds_are_fitted_and_predicted(tmp_path: Path, monkeypatch) -> None:
     assert shown.rows[0].cells[7].text == "m/s"
 
 
-def test_a_place_that_is_not_there_is_refused(tmp_path: Path, monkeypatch) -> None:
+def test_a_place_that_is_not_there_is_refused(tmp_path: Path) -> None:
     rough = PUNCH.replace("load_steps = 8", "load_steps = 2").replace("unload_steps = 8", "unload_steps = 2")
     rough += "[traces]\nsmoothing = 0.1\n"
-    context = replace(BLOCK, tools=rough).stored(tmp_path, monkeypatch, WAVES)
+    context = replace(BLOCK, tools=rough).stored(tmp_path, WAVES)
     file = tmp_path / "a-waves.csv"
     text = file.read_text()
     for name, told in (
