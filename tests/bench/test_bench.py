@@ -28,11 +28,7 @@ from limbfit.cli import main
 from limbfit.errors import InputError
 from limbfit.fe import ELEMENTS, StepControl, System
 from limbfit.mesh import cell_volumes, check, measure_quality
-
-REFERENCE = Path(__file__).parents[3] / "shared" / "reference"
-with_reference = pytest.mark.skipif(
-    not REFERENCE.is_dir(), reason="the FEBio reference results are not beside the repository"
-)
+from reference import REFERENCE, recorded
 
 
 def silent(done: int, total: int, text: str) -> None:
@@ -107,7 +103,7 @@ def test_scaling_in_fresh_processes():
 
 
 @pytest.mark.slow
-@with_reference
+@recorded
 def test_a_forward_run_as_febio_has_its_softer_contact():
     own, febio = (
         bench_forward(REFERENCE, "block/block_tet4", as_febio=chosen, tell=silent) for chosen in (False, True)
@@ -118,7 +114,7 @@ def test_a_forward_run_as_febio_has_its_softer_contact():
 
 
 @pytest.mark.febio
-@with_reference
+@recorded
 def test_the_ratio_is_that_of_two_times_measured_in_one_run(febio, monkeypatch):
     monkeypatch.setenv("FEBIO_CMD", str(febio))
     found = bench_forward(REFERENCE, "block/block_hex8", beside_febio=True, tell=silent)
@@ -130,7 +126,7 @@ def test_the_ratio_is_that_of_two_times_measured_in_one_run(febio, monkeypatch):
 
 
 @pytest.mark.febio
-@with_reference
+@recorded
 def test_a_socket_is_timed_beside_febio(febio, monkeypatch):
     monkeypatch.setenv("FEBIO_CMD", str(febio))
     found = bench_socket(REFERENCE, "tube", beside_febio=True, tell=silent)
@@ -158,7 +154,7 @@ def test_reference_is_found_beside_the_project(tmp_path, elsewhere):
     assert find_reference(inside) == folder
 
 
-@with_reference
+@recorded
 def test_every_case_is_there():
     for case in ALL_CASES:
         problem, control, log = load_case(case, REFERENCE)
@@ -166,7 +162,7 @@ def test_every_case_is_there():
         assert len(control.times) == len(log.times) - 1
 
 
-@with_reference
+@recorded
 def test_parity_rows():
     (row,) = bench_febio_parity(REFERENCE, cases=CUBES[:1], tell=silent)
     assert (row["case"], row["element"]) == ("cube_skin", "hex8")
@@ -175,7 +171,7 @@ def test_parity_rows():
     json.dumps(row, allow_nan=False)
 
 
-@with_reference
+@recorded
 def test_parity_of_a_socket_is_told_by_its_parts():
     """The input that takes least: each part has its goal, and is within it."""
     rows = bench_febio_parity(REFERENCE, cases=SOCKET[-1:], tell=silent)
@@ -187,7 +183,7 @@ def test_parity_of_a_socket_is_told_by_its_parts():
     json.dumps(row, allow_nan=False)
 
 
-@with_reference
+@recorded
 def test_a_missing_case_of_a_socket_is_bad_input(tmp_path):
     with pytest.raises(InputError, match=r"tube\.feb.*--reference"):
         bench_febio_parity(tmp_path, cases=SOCKET[-1:], tell=silent)

@@ -5,6 +5,9 @@ from pathlib import Path
 
 import numpy as np
 
+from limbfit.fe import Problem
+from limbfit.febio import FebModel, FebSettings, read_feb, to_problem, write_feb
+
 # The triangles of a box whose corners are numbered along x, then y, then z.
 BOX_FACES = np.array(
     [[0, 2, 3], [0, 3, 1], [4, 5, 7], [4, 7, 6], [0, 1, 5], [0, 5, 4], [2, 6, 7], [2, 7, 3], [0, 4, 6],
@@ -46,6 +49,26 @@ def written(folder: Path, text: str, name: str = "model.feb") -> Path:
     file = folder / name
     file.write_text(text)
     return file
+
+
+def export(problem: Problem, folder: Path, settings: FebSettings | None = None) -> str:
+    """What is written of a problem, in ``model.feb``."""
+    write_feb(problem, folder / "model.feb", settings or FebSettings())
+    return (folder / "model.feb").read_text(encoding="utf-8")
+
+
+def back(problem: Problem, folder: Path, settings: FebSettings | None = None) -> tuple[Problem, FebModel]:
+    """The problem, written and read, and what was read."""
+    export(problem, folder, settings)
+    model = read_feb(folder / "model.feb")
+    return to_problem(model), model
+
+
+def read_rows(file: Path, delimiter: str = ",") -> list[np.ndarray]:
+    """The rows of every step of a table: the item's number, then its values."""
+    steps = file.read_text().split("*Step")[1:]
+    rows = [[line for line in step.splitlines()[1:] if not line.startswith("*")] for step in steps]
+    return [np.array([line.split(delimiter) for line in step], dtype=float) for step in rows]
 
 
 def changed(text, pattern, by):

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from febfiles import changed, written
+from febfiles import back, changed, export, written
 
 from limbfit import OgdenQLV
 from limbfit.bench.timing import build_punched_block
@@ -32,7 +32,6 @@ from limbfit.febio import (
     read_log,
     run_feb,
     to_problem,
-    write_feb,
     write_inp,
 )
 from limbfit.febio.preparation import Preparation
@@ -72,13 +71,6 @@ def ball(axis=(0.0, 0.0, -1.0), x=0.0, motion=None, name="ball"):
     return RigidBody(shape, build_punched_block("hex8", 6).mesh.face_sets["skin"], down, name=name)
 
 
-def back(problem, folder, control=EXACT):
-    """The problem, written and read, and what was read."""
-    write_feb(problem, folder / "model.feb", FebSettings(steps=control))
-    model = read_feb(folder / "model.feb")
-    return to_problem(model), model
-
-
 def pushes(problem, control=EXACT, rest=0.0):
     """Reactions (n, b, 3) in space of every step, N, of a problem that waits for ``rest`` s more."""
     times = tuple(rest + t for t in (0.0, *control.times))
@@ -110,7 +102,7 @@ CASES = {
 )
 def test_it_pushes_as_hard_when_read_back(tmp_path, case):
     problem = block(bodies=(ball(),), **CASES[case])
-    found, model = back(problem, tmp_path)
+    found, model = back(problem, tmp_path, FebSettings(steps=EXACT))
     found = replace(found, indenter=ball().shape)
     assert model.settling_time_s == pytest.approx(Preparation.from_problem(problem).settling_s)
     np.testing.assert_array_equal(found.contact_faces, problem.bodies[0].faces)
@@ -123,7 +115,7 @@ def test_it_pushes_as_hard_when_read_back(tmp_path, case):
 
 def test_a_contraction_alone_is_written(tmp_path):
     problem = block(**TENSES)
-    found, _ = back(problem, tmp_path)
+    found, _ = back(problem, tmp_path, FebSettings(steps=EXACT))
     assert not found.rigid_bodies
     assert found.materials["muscle"] == TENSED
     assert [found.activation.at(t) for t in (0.35, 1.0, 9.0)] == pytest.approx(
@@ -137,7 +129,7 @@ def test_bodies_under_force_go_along_their_own_axis(tmp_path, axis):
     force = Motion.of([0.0, 1.0, 3.0], force={"z": [0.0, 0.8, 0.5]})
     bodies = (sheet(force, -12.0, axis, "left one"), sheet(force, 12.0, (0.2, 0.0, -1.0), "clamp at 25.7"))
     problem = block(bodies=bodies)
-    found, model = back(problem, tmp_path)
+    found, model = back(problem, tmp_path, FebSettings(steps=EXACT))
     assert [body.name for body in found.bodies] == ["left_one", "clamp_at_25_7"]
     assert len(model.rails) == 2 - (axis[0] == 0.0)
     mine, theirs = pushes(problem), pushes(found)
@@ -169,7 +161,7 @@ def test_an_indenter_touches_where_limbfit_has_found_it(tmp_path, case):
     """With its own shape in the place of its facets: FEBio's indenter comes from afar, and pushes as hard."""
     problem = block(indenter=PUNCH, **{"history": COURSE, **LATER[case]})
     control = LATE if problem.touch_down_s else replace(LATE, times=tuple(t - 2.0 for t in LATE.times[4:]))
-    found, model = back(problem, tmp_path, control)
+    found, model = back(problem, tmp_path, FebSettings(steps=control))
     own, rest = Preparation.from_problem(problem), 0.0 if problem.touch_down_s else 1.0
     assert own.seconds == pytest.approx(model.settling_time_s + rest)
     if found.indenter is not None:
@@ -188,8 +180,7 @@ def test_an_indenter_touches_where_limbfit_has_found_it(tmp_path, case):
 def test_tables_and_results_tell_the_time_of_each(tmp_path):
     """FEBio's time in its own tables, that of the problem in its result, whose way is from touch-down."""
     problem = block(indenter=PUNCH, history=COURSE, **LATER["taut and clamped"])
-    back(problem, tmp_path, LATE)
-    text = (tmp_path / "model.feb").read_text()
+    text = export(problem, tmp_path, FebSettings(steps=LATE))
     for words in ("<!-- pre-strain: grows in 1 s", "<!-- touch-down: where limbfit", "<!-- guides: bodies"):
         assert text.count(words) == 1
     begun = Preparation.from_problem(problem).seconds
@@ -251,9 +242,8 @@ HOLDS = '<rigid_bc type="rigid_fixed"><rb>clamp</rb><Rx_dof>1</Rx_dof></rigid_bc
 @pytest.fixture(scope="module")
 def taut_text(tmp_path_factory) -> str:
     """What is written of a clamped block with a pre-stretch."""
-    file = tmp_path_factory.mktemp("taut") / "model.feb"
-    write_feb(block(bodies=(CLAMP,), history=COURSE, prestretch=TAUT), file, FebSettings(steps=LATE))
-    return file.read_text()
+    problem = block(bodies=(CLAMP,), history=COURSE, prestretch=TAUT)
+    return export(problem, tmp_path_factory.mktemp("taut"), FebSettings(steps=LATE))
 
 
 @pytest.mark.parametrize("case", REFUSED)
@@ -280,10 +270,8 @@ CONTRACTIONS = {
 @pytest.fixture(scope="module")
 def tensed_text(tmp_path_factory) -> str:
     """What is written of a block of which both tissues contract."""
-    file = tmp_path_factory.mktemp("tensed") / "model.feb"
     both = TENSES | {"materials": {"skin": TENSED, "muscle": TENSED}}
-    write_feb(block(**both), file, FebSettings(steps=EXACT))
-    return file.read_text()
+    return export(block(**both), tmp_path_factory.mktemp("tensed"), FebSettings(steps=EXACT))
 
 
 @pytest.mark.parametrize("case", CONTRACTIONS)
@@ -296,12 +284,10 @@ def test_contractions_that_limbfit_has_not_are_refused(tmp_path, tensed_text, ca
 def test_what_febio_cannot_express_is_refused(tmp_path):
     squeezed = block(prestretch=0.9 * np.eye(3), bodies=(ball(),))
     with pytest.raises(ProblemError, match="its volume, which FEBio's pressure does not see; give one"):
-        write_feb(squeezed, tmp_path / "model.feb", FebSettings())
+        export(squeezed, tmp_path)
     dragged = Motion.of([0.0, 1.0, 3.0], x=[0.0, 0.0, 1.0], force={"z": [0.0, 0.8, 0.5]})
     with pytest.raises(ProblemError, match=r"between x, y and z.*turn_to_indenter_frame"):
-        write_feb(
-            block(bodies=(ball((0.2, 0.0, -1.0), motion=dragged),)), tmp_path / "model.feb", FebSettings()
-        )
+        export(block(bodies=(ball((0.2, 0.0, -1.0), motion=dragged),)), tmp_path)
     late = replace(build_punched_block("tet4", 4), history=COURSE, touch_down_s=HELD_S)
     for held in (late, block(prestretch=TAUT), block(bodies=(ball(),))):
         with pytest.raises(ProblemError, match="cannot follow where a clamped, tensed or pre-strained limb"):

@@ -1,11 +1,10 @@
 """Rigid bodies of any motion, both ways: read from an input, written, and read back with the same forces."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
-from febfiles import FEB, changed, written
+from febfiles import FEB, back, changed, export, read_rows, written
 
 from limbfit.bench.timing import build_punched_block
 from limbfit.errors import ProblemError
@@ -29,10 +28,11 @@ from limbfit.febio import (
     run_feb,
     to_problem,
     turn_to_indenter_frame,
-    write_feb,
 )
+from reference import REFERENCE, recorded
 
 STEPS = StepControl(times=(0.5, 1.0, 1.5, 2.0), stress="linear", penalty=20.0, penetration=1.0)
+SETTINGS = FebSettings(steps=STEPS, force_file="forces.txt")
 TIMES, END = [0.0, 1.0, 2.0], History(np.array([0.0, 2.0]), np.zeros(2))
 SIDE = np.array([[x, y, 0.2] for x in (-8.0, 0.0, 8.0) for y in (-8.0, 8.0)])
 # Four triangles, counter-clockwise seen from below.
@@ -48,12 +48,6 @@ def block(divisions=4, **changes):
 def sheet(motion, **changes):
     faces = build_punched_block("hex8", 4).mesh.face_sets["skin"]
     return RigidBody(SHEET, faces, motion, 0.3, pivot=(1.0, 2.0, 4.0), name="sheet", **changes)
-
-
-def back(problem, folder):
-    """The problem, written and read."""
-    write_feb(problem, folder / "model.feb", FebSettings(steps=STEPS, force_file="forces.txt"))
-    return to_problem(read_feb(folder / "model.feb"))
 
 
 MOTIONS = {
@@ -77,7 +71,7 @@ def test_a_body_is_read_back_as_it_was(tmp_path, case):
         supports=(Support(problem.fixed[:3], 1),),
         pressures=(Pressure(problem.mesh.face_sets["skin"][:4], [0.0, 1.5, 2.0], [0.0, 1e-3, 0.0]),),
     )
-    found = back(problem, tmp_path)
+    found, _ = back(problem, tmp_path, SETTINGS)
     assert found.indenter is None
     (mine,), (theirs,) = problem.bodies, found.bodies
     assert (theirs.name, theirs.friction, theirs.sticking) == ("sheet", 0.3, "stepwise")
@@ -111,7 +105,7 @@ def test_several_bodies_push_as_hard_when_read_back(tmp_path):
     ball = Indenter("sphere", 16.0, centre=(14.0, 0.0, 0.3), axis=(0.0, 0.0, -1.0), edge=(1.0, 0.0, 0.0))
     dragged = RigidBody(ball, faces, Motion.of(TIMES, x=[0.0, 0.0, 1.0], z=[0.0, 2.0, 2.0]), 0.4, name="ball")
     problem = replace(block(6, bodies=(dragged,)), indenter=punch, history=down, start="as-given")
-    found = back(problem, tmp_path)
+    found, _ = back(problem, tmp_path, SETTINGS)
     assert [body.name for body in found.rigid_bodies] == ["indenter", "ball"]
     assert [body.friction for body in found.rigid_bodies] == ["frictionless", 0.4]
     one, other = (solve(p, STEPS, store="none") for p in (problem, found))
@@ -130,8 +124,7 @@ def test_several_bodies_push_as_hard_when_read_back(tmp_path):
 
 def test_the_table_of_a_body_that_turns(tmp_path):
     """Place, rotation vector, force and moment about the centre of mass, which is not where it is pressed."""
-    write_feb(block(bodies=(sheet(MOTIONS["turned"]),)), tmp_path / "model.feb", FebSettings())
-    text = (tmp_path / "model.feb").read_text()
+    text = export(block(bodies=(sheet(MOTIONS["turned"]),)), tmp_path)
     table = "x;y;z;thx;thy;thz;Fx;Fy;Fz;Mx;My;Mz"
     nodes = '<node_data data="x;y;z" file="nodes.txt" delim=","></node_data></logfile>'
     text = text.replace("Fx;Fy;Fz;x;y;z", table).replace("</logfile>", nodes)
@@ -155,8 +148,7 @@ def test_moments_are_about_the_centre_of_mass(tmp_path):
     tables = []
     for pivot in ((1.0, 2.0, 4.0), (-3.0, 5.0, 1.0)):
         body = replace(sheet(MOTIONS["moved"]), pivot=pivot)
-        write_feb(block(bodies=(body,)), tmp_path / "model.feb", FebSettings())
-        text = (tmp_path / "model.feb").read_text().replace("Fx;Fy;Fz;x;y;z", "Fx;Fy;Fz;Mx;My;Mz")
+        text = export(block(bodies=(body,)), tmp_path).replace("Fx;Fy;Fz;x;y;z", "Fx;Fy;Fz;Mx;My;Mz")
         run_feb(written(tmp_path, text, "asked.feb"), tmp_path / "out", times=(1.0, 2.0))
         tables.append(read_log(tmp_path / "out" / "forces.txt").values[-1, 0])
     np.testing.assert_allclose(tables[1][:3], tables[0][:3], rtol=1e-9)
@@ -169,7 +161,7 @@ def test_a_pressure_alone_is_read_back(tmp_path):
     problem = block()
     faces = problem.mesh.face_sets["skin"][:9]
     problem = replace(problem, pressures=(Pressure(faces, TIMES, [0.0, 2e-3, 0.0]),))
-    found = back(problem, tmp_path)
+    found, _ = back(problem, tmp_path, SETTINGS)
     np.testing.assert_array_equal(found.pressures[0].faces, faces)
     assert not found.rigid_bodies
     assert found.pressures[0].at(0.5) == pytest.approx(1e-3)
@@ -183,14 +175,14 @@ def test_a_force_between_the_axes_beside_a_move_is_refused_and_can_be_turned(tmp
     faces = problem.contact_faces
     problem = replace(problem, indenter=oblique, history=history)
     with pytest.raises(ProblemError, match=r"between x, y and z.*turn_to_indenter_frame"):
-        write_feb(problem, tmp_path / "model.feb", FebSettings())
+        export(problem, tmp_path)
     ball = RigidBody(replace(oblique, centre=(5.0, 4.0, 1.0)), faces, history.motion, name="b")
     turned = turn_to_indenter_frame(replace(problem, bodies=(ball,)))
     points = problem.mesh.points[:50]
     before = [body.shape.signed_distance(points) for body in (problem.rigid_bodies[0], ball)]
     after = [body.shape.signed_distance(turned.mesh.points[:50]) for body in turned.rigid_bodies]
     np.testing.assert_allclose(after, before, atol=1e-9)
-    found = back(turned, tmp_path)
+    found, _ = back(turned, tmp_path, SETTINGS)
     assert [body.motion.free.tolist() for body in found.rigid_bodies] == [
         [False, False, True] + 3 * [False]
     ] * 2
@@ -202,9 +194,8 @@ NAMED = "".join(f"<R{x}_dof>1</R{x}_dof>" for x in "xyzuvw")
 
 def test_turns_that_febio_adds_up_another_way_are_refused(tmp_path):
     with pytest.raises(ProblemError, match="sheet: a turn about several axes"):
-        write_feb(block(bodies=(sheet(TWICE),)), tmp_path / "model.feb", FebSettings())
-    write_feb(block(bodies=(sheet(MOTIONS["turned"]),)), tmp_path / "model.feb", FebSettings())
-    text = (tmp_path / "model.feb").read_text()
+        export(block(bodies=(sheet(TWICE),)), tmp_path)
+    text = export(block(bodies=(sheet(MOTIONS["turned"]),)), tmp_path)
     more = '<rigid_bc type="rigid_rotation"><rb>sheet</rb><dof>Ru</dof><value lc="1">1</value></rigid_bc>'
     with pytest.raises(
         ProblemError, match=r"line \d+: the rigid body 'sheet' turns about more than one axis"
@@ -243,9 +234,7 @@ SECOND = '<contact type="sliding-elastic" surface_pair="sheet_contact"><fric_coe
 @pytest.fixture(scope="module")
 def let_go_text(tmp_path_factory) -> str:
     """What is written of a sheet that goes over from displacement to force."""
-    file = tmp_path_factory.mktemp("let-go") / "model.feb"
-    write_feb(block(bodies=(sheet(MOTIONS["let go"]),)), file, FebSettings())
-    return file.read_text()
+    return export(block(bodies=(sheet(MOTIONS["let go"]),)), tmp_path_factory.mktemp("let-go"))
 
 
 @pytest.mark.parametrize("case", REFUSED)
@@ -255,15 +244,12 @@ def test_what_limbfit_has_not_is_refused(tmp_path, let_go_text, case):
         to_problem(read_feb(written(tmp_path, change(let_go_text))))
 
 
-SOCKET = Path(__file__).parents[3] / "shared" / "reference" / "socket"
-
-
-@pytest.mark.skipif(not SOCKET.is_dir(), reason="the FEBio reference results are not beside the repository")
+@recorded
 @pytest.mark.parametrize("case", ["slide", "cone-load", "tube"])
 def test_febios_own_inputs_are_written_anew(tmp_path, case):
     """A dragged plate, a socket that goes over to a force, a tube under pressure: read, written, read."""
-    problem = to_problem(read_feb(SOCKET / f"{case}.feb"))
-    found = back(problem, tmp_path)
+    problem = to_problem(read_feb(REFERENCE / "socket" / f"{case}.feb"))
+    found, _ = back(problem, tmp_path, SETTINGS)
     smooth = [isinstance(body.shape, SmoothSurface) for body in (*problem.rigid_bodies, *found.rigid_bodies)]
     assert smooth == [case == "cone-load"] * len(smooth)  # the hollow of the socket, not the plate
     assert len(found.rigid_bodies) == len(problem.rigid_bodies)
@@ -337,8 +323,7 @@ def test_tissue_goes_with_the_rigid_body_that_carries_it(tmp_path, text):
     np.testing.assert_allclose(log.column("Fz"), 100.0 * stress, rtol=1e-6, atol=1e-9)
     np.testing.assert_allclose(log.column("z"), 11.0 - 3.0 * log.times)
     assert np.abs(log.column("Fx")).max() < 1e-9 * np.abs(log.column("Fz")).max()  # N, by symmetry
-    last = (tmp_path / "out" / "nodes.txt").read_text().rpartition("*Data")[2].splitlines()[1:]
-    heights = {int(row.split(",")[0]): float(row.split(",")[1]) for row in last}
+    heights = dict(read_rows(tmp_path / "out" / "nodes.txt")[-1])
     assert [heights[node] for node in (5, 6, 7, 8)] == pytest.approx([7.0] * 4)
     assert [heights[node] for node in (9, 10, 11, 12)] == pytest.approx([9.0] * 4)
     assert [heights[node] for node in (21, 22, 23, 24)] == pytest.approx([3.5] * 4, rel=1e-6)

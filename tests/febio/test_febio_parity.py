@@ -42,8 +42,8 @@ from limbfit.febio.abaqus import write_inp
 from limbfit.febio.optimisation import ParameterRange, turn_to_indenter_frame, write_optimisation
 from limbfit.febio.preparation import Preparation
 from limbfit.mesh import Mesh
+from reference import REFERENCE, recorded
 
-REFERENCE = Path(__file__).parents[3] / "shared" / "reference"
 pytestmark = pytest.mark.febio
 
 SKIN, MUSCLE = OgdenQLV(0.009, 6.0, 2.0, 0.5), OgdenQLV(0.004, 4.0, (0.8, 0.3), (0.2, 1.5))
@@ -185,9 +185,7 @@ def test_a_clamped_limb_is_touched_later_and_pushes_as_hard(febio, tmp_path, tau
     assert gap < 0.02 * theirs.peak_force
 
 
-@pytest.mark.skipif(
-    not REFERENCE.is_dir(), reason="the FEBio reference results are not beside the repository"
-)
+@recorded
 def test_febios_own_fit_ends_at_the_relaxation_that_made_the_force(febio, tmp_path):
     """Without the ties of c, m and the bulk modulus: not every FEBio has LEVMAR, which they need."""
     true, start = OgdenQLV(0.004, 4.0, 2.0, 0.5), OgdenQLV(0.004, 4.0, 1.6, 0.6)

@@ -2,10 +2,10 @@
 
 import gzip
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
+from febfiles import back, export
 
 from limbfit.bench.timing import build_punched_block
 from limbfit.fe import State, Step, StepControl, System, solve
@@ -17,19 +17,15 @@ from limbfit.febio import (
     compute_axial_force,
     compute_mean_penalty,
     describe_differences,
-    read_feb,
     read_log,
     run_feb,
-    to_problem,
     write_feb,
 )
 from limbfit.febio.penalty import CURRENT_AREA, compute_automatic_penalties, compute_explicit_penalty
 from limbfit.febio.reading.model import Contact
+from reference import REFERENCE, recorded
 
-EXPORTS = Path(__file__).parents[3] / "shared" / "reference" / "exports"
-recorded = pytest.mark.skipif(
-    not EXPORTS.is_dir(), reason="FEBio's runs of exports are not beside the repository"
-)
+EXPORTS = REFERENCE / "exports"
 SITES = ("01", "05", "10", "13", "15", "17")
 
 
@@ -121,25 +117,23 @@ def test_an_explicit_penalty_goes_out_and_comes_back(tmp_path):
     """It is as stiff as limbfit's: what is read has the stiffness that limbfit has."""
     problem = build_punched_block("tet4", 4)
     steps = StepControl(penalty=300.0)
-    write_feb(problem, tmp_path / "model.feb", FebSettings(steps=steps))
+    again, model = back(problem, tmp_path, FebSettings(steps=steps))
     text = (tmp_path / "model.feb").read_text()
     for tag in ("<auto_penalty>0<", "<max_ups>0<", "<max_refs>60<"):
         assert tag in text
-    model = read_feb(tmp_path / "model.feb")
-    found = build_step_control(model, to_problem(model))
+    found = build_step_control(model, again)
     assert found.penalty == pytest.approx(300.0)
     modulus = np.mean([m.instantaneous_modulus for m in problem.materials.values()])
     assert compute_explicit_penalty(problem, steps) == pytest.approx(300.0 * modulus / CURRENT_AREA)
     assert compute_explicit_penalty(problem, StepControl()) == pytest.approx(100.0 * modulus / CURRENT_AREA)
-    write_feb(problem, tmp_path / "model.feb", FebSettings(penalty=3.0))
-    assert "<penalty>3.0</penalty>\n<auto_penalty>1<" in (tmp_path / "model.feb").read_text()
+    text = export(problem, tmp_path, FebSettings(penalty=3.0))
+    assert "<penalty>3.0</penalty>\n<auto_penalty>1<" in text
 
 
 def test_what_differs_is_said_in_the_file(tmp_path):
     problem = build_punched_block("tet4", 4)
     for settings, words in ((FebSettings(), "as stiff as limbfit's; FEBio's"), (FebSettings(3.0), "smaller")):
-        write_feb(problem, tmp_path / "model.feb", settings)
-        text = (tmp_path / "model.feb").read_text()
+        text = export(problem, tmp_path, settings)
         lines = describe_differences(problem, settings)
         assert words in lines[0]
         assert all(f"<!-- {line} -->" in text for line in lines)

@@ -20,10 +20,10 @@ from limbfit.errors import InputError, ProblemError, RunError
 from limbfit.fe import History
 from limbfit.febio import RunVerdict, build_result, find_febio, judge_run, read_log, run_febio
 from limbfit.febio.program import ERROR_TERMINATION, NORMAL_TERMINATION
+from reference import REFERENCE, recorded
 
-LOGS = Path(__file__).parents[3] / "shared" / "reference" / "febio-logs"
+LOGS = REFERENCE / "febio-logs"
 END = 12.708333333333334
-recorded = pytest.mark.skipif(not LOGS.is_dir(), reason="FEBio's recorded runs are not beside the repository")
 VERDICTS = {
     "bad-material": ("input", 'could not read its input: tag "SolidDomain" (line 3625) : invalid value'),
     "broken-xml": ("input", "could not read its input: Unexpected end of file"),

@@ -16,6 +16,7 @@ from limbfit.pipeline.identification.search import build_problem
 from limbfit.report.sections.design import make_protocol_section
 from limbfit.report.store import load_store
 
+SESSION = {"minutes": 6, "depths_mm": (3.0,), "holds_s": (0, 10), "draws": 1}
 BALL = '[indenters.ball]\nshape = "sphere"\nwidth_mm = 12.0\n[acquire]\nforce_limit_N = 45.0\n'
 
 
@@ -26,7 +27,7 @@ def found(pristine: Path):
     one, _, _ = file.read_text().rpartition("[[sites]]")
     file.write_text(one + COARSE + BALL)
     study = limbfit.load_study(pristine)
-    return study, limbfit.plan_protocol(study, minutes=6, depths_mm=(3.0,), holds_s=(0, 10), draws=1)
+    return study, limbfit.plan_protocol(study, **SESSION)
 
 
 def test_the_session_keeps_its_time_and_tells_more_than_plain_ramps(found) -> None:
@@ -60,9 +61,7 @@ def test_several_depths_are_chosen_from(found) -> None:
 def test_what_is_to_be_determined_is_determined_better(found) -> None:
     study, content = found
     name = "muscle.tau_s"
-    own = limbfit.plan_protocol(
-        study, minutes=6, depths_mm=(3.0,), holds_s=(0, 10), draws=1, determine=(name,), criterion="A"
-    )
+    own = limbfit.plan_protocol(study, **SESSION, determine=(name,), criterion="A")
     best, every = own["protocols"][0], content["protocols"][0]
     assert best["design"] == every["design"] == DESIGNED
     assert best["factor_95"][name] <= every["factor_95"][name] + 1e-9
@@ -71,7 +70,7 @@ def test_what_is_to_be_determined_is_determined_better(found) -> None:
 
 def test_the_records_are_a_study_s_own(found, tmp_path) -> None:
     study, _ = found
-    content = limbfit.plan_protocol(study, minutes=6, depths_mm=(3.0,), holds_s=(0, 10), draws=1)
+    content = limbfit.plan_protocol(study, **SESSION)
     text = (Path(content["folder"]) / "records.toml").read_text()
     tables = tomllib.loads(text)["records"]
     assert len(tables) == len(content["records"])
@@ -99,9 +98,9 @@ def test_the_tissues_lie_within_bounds_and_about_what_is_known(found) -> None:
 
 def test_what_cannot_be_planned_is_one_line(found) -> None:
     study, _ = found
-    same = {"depths_mm": np.array([3.0]), "holds_s": np.array([0, 10]), "draws": 1}
+    same = SESSION | {"depths_mm": np.array([3.0]), "holds_s": np.array([0, 10])}
     with pytest.raises(InputError, match="no record fits into 1 min"):
-        limbfit.plan_protocol(study, minutes=1, **same)
+        limbfit.plan_protocol(study, **same | {"minutes": 1})
     with pytest.raises(InputError, match=r"no parameter is named 'bone\.c_kPa'"):
         limbfit.plan_protocol(study, determine=("bone.c_kPa",), **same)
     with pytest.raises(InputError, match=r"no current socket.*run limbfit socket"):
@@ -110,7 +109,7 @@ def test_what_cannot_be_planned_is_one_line(found) -> None:
 
 def test_it_is_in_the_report(found) -> None:
     study, _ = found
-    content = limbfit.plan_protocol(study, minutes=6, depths_mm=(3.0,), holds_s=(0, 10), draws=1)
+    content = limbfit.plan_protocol(study, **SESSION)
     section = make_protocol_section(load_store(study.results), Store(study.results).results.protocol)
     assert section.title == "Which records to make"
     assert any(
@@ -129,7 +128,7 @@ def test_it_is_in_the_report(found) -> None:
 )
 def test_what_is_seen_tells_more_in_the_same_time(found, key: str, sd: float, end: str) -> None:
     study, content = found
-    seen = limbfit.plan_protocol(study, minutes=6, depths_mm=(3.0,), holds_s=(0,), draws=1, **{key: sd})
+    seen = limbfit.plan_protocol(study, **SESSION | {"holds_s": (0,), key: sd})
     rows = {row["design"]: row for row in seen["protocols"]}
     assert rows[DESIGNED]["cost"] < rows[UNSEEN]["cost"]
     plain = {row["design"]: row for row in content["protocols"]}[PLAIN]
