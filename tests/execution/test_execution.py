@@ -60,10 +60,15 @@ def unpicklable(_):
     return lambda: 1
 
 
+def is_first_call(marker):
+    """True once for each file."""
+    first = not Path(marker).exists()
+    Path(marker).touch()
+    return first
+
+
 def die_once(marker):
-    path = Path(marker)
-    if not path.exists():
-        path.touch()
+    if is_first_call(marker):
         os.kill(os.getpid(), signal.SIGKILL)
     return "alive"
 
@@ -325,9 +330,7 @@ def test_workers_do_not_outlive_a_killed_parent():
 
 
 def hang_once(marker):
-    path = Path(marker)
-    if not path.exists():
-        path.touch()
+    if is_first_call(marker):
         time.sleep(600)
     return "alive"
 

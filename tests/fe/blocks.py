@@ -22,8 +22,9 @@ from limbfit.fe import (
     System,
     solve,
 )
+from limbfit.fe.contact.rigid import RigidShape
 from limbfit.fe.kernel.laws import Laws
-from limbfit.fe.motion import Drives
+from limbfit.fe.motion import Drives, Motion
 from limbfit.fe.solution.linear import multiply_symmetric
 from limbfit.fe.system import Evaluation, Increment
 from limbfit.mesh import TET10_EDGES, TET_FACES, Mesh
@@ -175,11 +176,24 @@ def quarter_tube(mesh: Mesh, law: Material, body: RigidBody, **how: Any) -> Prob
     return untouched(mesh, law, still, supports=planes, bodies=(body,), **how)
 
 
-def press_fit(law: NeoHookean, inner: float, outer: float, overlap: float) -> float:
-    """Pressure, MPa, of a rigid ring on a tube ``overlap`` mm too wide: Lame, plane strain, small strain."""
-    G, K, a, b = law.shear_modulus, law.kappa_ratio * law.shear_modulus, inner, outer
+TUBE, OVERLAP = sector(np.linspace(10.0, 20.0, 13), 24), 0.04
+
+
+def check_press_fit(shape: RigidShape, motion: Motion, times: tuple[float, ...], **how: object) -> None:
+    """A rigid ring that ends up `OVERLAP` mm too narrow on the `TUBE`, and is pulled along it.
+
+    The pressure is Lame's, of plane strain and small strain; the pull is mu p A.
+    """
+    a, b, mu, law = 10.0, 20.0, 0.2, NeoHookean(0.01, kappa_ratio=20.0)
+    problem = quarter_tube(TUBE, law, RigidBody(shape, TUBE.face_sets["outside"], motion, mu), **how)
+    found = solve(problem, StepControl(times=times, penalty=2000.0, hold_penalty=True, penetration=1.0))
+    assert found.completed, found.reason
+    G, K = law.shear_modulus, law.kappa_ratio * law.shear_modulus
     E, nu = 9 * K * G / (3 * K + G), (3 * K - 2 * G) / (2 * (3 * K + G))
-    return overlap * E * (b**2 - a**2) / (b * (1 + nu) * ((1 - 2 * nu) * b**2 + a**2))
+    pressure = OVERLAP * E * (b**2 - a**2) / (b * (1 + nu) * ((1 - 2 * nu) * b**2 + a**2))
+    radial, axial = -found.reactions[-1, 0, 0], found.reactions[-1, 0, 2]
+    assert radial == pytest.approx(pressure * b * float(TUBE.points[:, 2].max()), rel=0.01)
+    assert axial == pytest.approx(mu * np.pi / 2 * radial, rel=0.01)
 
 
 def check_tangent(

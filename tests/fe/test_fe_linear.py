@@ -15,6 +15,7 @@ from limbfit.fe.solution.factor import Factor, find_touched_unknowns
 from limbfit.fe.solution.linear import (
     SOLVERS,
     WITHOUT_PARDISO,
+    LinearSolver,
     NotPositiveDefiniteError,
     build_linear_solver,
     multiply_symmetric,
@@ -36,14 +37,19 @@ def upper(A: sp.csr_matrix) -> sp.csr_matrix:
     return U
 
 
+def solver_of(U: sp.csr_matrix, name: str, **how: object) -> LinearSolver:
+    """The named solver, if there is one here."""
+    try:
+        return build_linear_solver(U.indptr, U.indices, name, **how)
+    except (ImportError, OSError):
+        pytest.skip(f"{name} is not installed")
+
+
 @pytest.mark.parametrize("name", sorted(SOLVERS))
 def test_peers_solve_alike(name):
     A, b = system()
     U = upper(A)
-    try:
-        solver = build_linear_solver(U.indptr, U.indices, name)
-    except (ImportError, OSError):
-        pytest.skip(f"{name} is not installed")
+    solver = solver_of(U, name)
     for scale in (1.0, 3.0):
         solver.factorise(scale * U.data)
         np.testing.assert_allclose(solver.solve(b), np.linalg.solve(scale * A.toarray(), b), atol=1e-9)
@@ -56,10 +62,7 @@ def test_halves_of_solutions_make_the_whole_and_those_among_the_last_unknowns_ar
     A, b = system()
     U = upper(A)
     wanted = np.array([3, 50, 51, 120, 198, 199], dtype=np.int32)
-    try:
-        solver = build_linear_solver(U.indptr, U.indices, name, threads, last=wanted)
-    except (ImportError, OSError):
-        pytest.skip(f"{name} is not installed")
+    solver = solver_of(U, name, threads=threads, last=wanted)
     solver.factorise(U.data)
     inverse = np.linalg.inv(A.toarray())
     half = solver.forward(b)
@@ -124,10 +127,7 @@ def test_springs_on_held_nodes_are_no_columns_of_unknowns_that_go_last():
 def test_cholesky_notices_an_indefinite_matrix(name):
     A, _ = system()
     U = upper((A - 5.0 * sp.identity(A.shape[0])).tocsr())
-    try:
-        solver = build_linear_solver(U.indptr, U.indices, name)
-    except (ImportError, OSError):
-        pytest.skip(f"{name} is not installed")
+    solver = solver_of(U, name)
     with pytest.raises(NotPositiveDefiniteError):
         solver.factorise(U.data)
 

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from seen_blocks import TRUTH
 
 from layered import blocks_study, store_blocks
 from limbfit import check_study, load_study
@@ -17,10 +18,6 @@ from limbfit.report.page import Table
 from limbfit.report.sections.inputs import draw_record_figure, make_record_section
 from limbfit.report.store import load_store
 
-TRUTH = {
-    "skin": {"c_kPa": 9.0, "m": 6.0, "gamma": 2.0, "tau_s": 0.6},
-    "muscle": {"c_kPa": 4.5, "m": 4.5, "gamma": 3.0, "tau_s": 0.3},
-}
 PROTOCOLS = {
     "held": (
         (0.0, 2.5, 32.5, 35.0),
