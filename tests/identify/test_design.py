@@ -5,7 +5,7 @@ from itertools import combinations
 
 import numpy as np
 import pytest
-from bars import PAPER, SITES, TRUTH, simulate
+from bars import PAPER, SITES, TRUTH, records, simulate
 
 from limbfit.errors import CalibrationError
 from limbfit.identify.checks.design import (
@@ -26,7 +26,7 @@ from limbfit.identify.checks.design import (
     sample_tissues,
 )
 from limbfit.identify.fit.calibration import calibrate
-from limbfit.identify.fit.objective import MeasuredCurve, SiteResponse
+from limbfit.identify.fit.objective import SiteResponse
 from limbfit.identify.fit.parameters import Prior, build_space, constrain, group_separately
 
 SPACE = build_space(PAPER, group_separately(PAPER.names))
@@ -36,6 +36,14 @@ PRIOR = compute_prior_information(PAPER, SPACE)
 def build_candidate(site, depth_mm, response, parameters, noise):
     """The candidate of a simulated indentation."""
     return Candidate(site, depth_mm, compute_information(response, parameters, noise))
+
+
+def build_candidates(noise) -> list[Candidate]:
+    """Those of the bars, at the truth."""
+    return [
+        build_candidate(f"s{k}", site.depth, site.respond(TRUTH), TRUTH, NoiseModel(noise))
+        for k, site in enumerate(SITES)
+    ]
 
 
 def lines(slopes, noise=0.1):
@@ -120,18 +128,11 @@ def test_efficiency_is_the_share_of_the_data_that_tells_as_much():
 
 
 def test_expected_widths_are_those_that_repeated_fits_scatter_with():
-    noise, sd = NoiseModel(0.03), []
-    truth = TRUTH
-    every = [build_candidate(f"s{k}", s.depth, s.respond(truth), truth, noise) for k, s in enumerate(SITES)]
-    expected = evaluate_design(every, range(4), PRIOR)
+    sd, stages = [], (group_separately(PAPER.names),)
+    expected = evaluate_design(build_candidates(0.03), range(4), PRIOR)
     for seed in range(25):
-        rng = np.random.default_rng(seed)
-        data = [
-            MeasuredCurve(f"s{k}", s.force(truth) + 0.03 * rng.standard_normal(s.points))
-            for k, s in enumerate(SITES)
-        ]
-        found = calibrate(simulate, data, PAPER.with_start(truth), stages=(group_separately(PAPER.names),))
-        sd.append(np.log(found.parameters / truth))
+        found = calibrate(simulate, records(0.03, seed=seed), PAPER.with_start(TRUTH), stages=stages)
+        sd.append(np.log(found.parameters / TRUTH))
     spread, said = np.std(sd, axis=0), np.log(expected.factors_95) / 1.96
     known = said < 0.2  # where the linearisation holds
     assert known.sum() >= 4
@@ -274,10 +275,7 @@ def test_what_a_study_fixes_is_known_and_what_it_ties_is_one():
     """skin.m is fixed; the records tell tau_s of both tissues only together."""
     fixed, tied = ["skin.m"], [["skin.tau_s", "muscle.tau_s"]]
     space = build_space(PAPER, constrain(group_separately(PAPER.names), PAPER.names, fixed, tied))
-    candidates = [
-        build_candidate(f"s{k}", 4.0, site.respond(TRUTH), TRUTH, NoiseModel(0.05))
-        for k, site in enumerate(SITES)
-    ]
+    candidates = build_candidates(0.05)
     prior = compute_prior_information(PAPER, space)
     factors = evaluate_design(candidates, [0, 1], prior).factors_95
     assert factors[1] == pytest.approx(1.0, abs=1e-3)
@@ -306,10 +304,7 @@ def test_stated_priors_count_beside_the_data_of_a_design():
     """skin.m is known within 5 %: no record has to tell it, and its interval is no wider."""
     known = replace(PAPER, priors=(Prior("skin.m", 6.0, 1.05),))
     plain, stated = (compute_prior_information(one, SPACE) for one in (PAPER, known))
-    candidates = [
-        build_candidate(f"s{k}", 4.0, site.respond(TRUTH), TRUTH, NoiseModel(0.5))
-        for k, site in enumerate(SITES)
-    ]
+    candidates = build_candidates(0.5)
     without, beside = (evaluate_design(candidates, [3], prior).factors_95[1] for prior in (plain, stated))
     assert without > 2.0
     assert beside < 1.05**1.97
