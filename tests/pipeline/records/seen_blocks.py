@@ -65,14 +65,14 @@ class SeenBlock:
     ``wanted`` says of a model on its mesh what is seen; ``write`` writes it, of the simulation.
     """
 
-    thickness: tuple[float, float]
-    half: float
-    growth: float
-    divisions: int
-    tools: str
     seen: str
     wanted: Callable[[SiteModel, Mesh], SiteModel]
     write: Callable[[Study, SiteModel, Simulation, Made], None]
+    thickness: tuple[float, float] = (3.0, 9.0)
+    half: float = 12.0
+    growth: float = 3.0
+    divisions: int = 4
+    tools: str = PUNCH
 
     def mesh(self) -> Mesh:
         return layered_block(self.thickness, ("skin", "muscle"), self.half, 6, self.growth)

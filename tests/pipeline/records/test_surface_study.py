@@ -58,7 +58,7 @@ def write_seen(study: Study, model: SiteModel, found: Simulation, made: Made) ->
     )
 
 
-BLOCK = SeenBlock((3.0, 12.0), 24.0, 4.0, 6, TOOLS, "a-surface.csv", with_points, write_seen)
+BLOCK = SeenBlock("a-surface.csv", with_points, write_seen, (3.0, 12.0), 24.0, 4.0, 6, TOOLS)
 
 
 @pytest.mark.slow

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from seen_blocks import PUNCH, Made, SeenBlock
+from seen_blocks import Made, SeenBlock
 
 import layered
 from layered import build_block_site, layered_block
@@ -138,16 +138,7 @@ def write_seen(study: Study, model: SiteModel, found: Simulation, made: Made) ->
     write_ultrasound(study.path(Path("a-layers.csv")), whole, layers, random)
 
 
-BLOCK = SeenBlock(
-    (3.0, 9.0),
-    12.0,
-    3.0,
-    4,
-    PUNCH,
-    "a-layers.csv",
-    lambda model, mesh: replace(model, layers=("skin", "muscle")),
-    write_seen,
-)
+BLOCK = SeenBlock("a-layers.csv", lambda model, mesh: replace(model, layers=("skin", "muscle")), write_seen)
 
 
 @pytest.mark.slow

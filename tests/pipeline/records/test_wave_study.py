@@ -31,14 +31,7 @@ def write_seen(study: Study, model: SiteModel, found: Simulation, made: Made) ->
 
 
 BLOCK = SeenBlock(
-    (3.0, 9.0),
-    12.0,
-    3.0,
-    4,
-    PUNCH,
-    "a-waves.csv",
-    lambda model, mesh: replace(model, waves=place_waves_under(model, mesh)),
-    write_seen,
+    "a-waves.csv", lambda model, mesh: replace(model, waves=place_waves_under(model, mesh)), write_seen
 )
 
 
