@@ -4,8 +4,8 @@ The cases that FEBio has solved are data here, with everything that is set for e
 (friction, press fit, force control, pressure) are FEBio's own inputs, run as they are.
 """
 
-import math
 import tempfile
+import tomllib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -49,37 +49,6 @@ class ReferenceCase:
     note: str = ""
 
 
-CUBES = tuple(
-    ReferenceCase(f"cube/cube_{tissue}", "hex8", {}, {"tolerance": 1e-9}, 1, "one element: rounding")
-    for tissue in ("skin", "muscle", "bosboom", "lim", "lim_par")
-)
-
-# FEBio's automatic penalty is 3 times the modulus times A/V of each element: softer than limbfit's own, and
-# softer for hexahedra than for the smaller tetrahedra.  ``penalty`` (1/mm) is its mean, and ``penetration``
-# lets the punch sink in as far as it then does.  FEBio's default tet10 has 8 quadrature points.
-_NOTE = "penalty per element and over the current area in FEBio, uniform over the reference area here"
-
-
-def _build_punched_case(name: str, element: str, penalty: float, symmetry: int) -> ReferenceCase:
-    problem = {"contact_rule": "gauss", "element": "tet10g8" if element == "tet10" else element}
-    control = {"penalty": penalty, "penetration": 1.0}
-    return ReferenceCase(name, element, problem, control, symmetry, _NOTE)
-
-
-PUNCHED = (
-    _build_punched_case("block/block_hex8", "hex8", 8.7, 4),
-    _build_punched_case("block/block_tet4", "tet4", 26.0, 4),
-    _build_punched_case("block/block_tet10", "tet10", 26.0, 4),
-    _build_punched_case("residuum/posterior_tet4", "tet4", 12.5, 1),
-    _build_punched_case("residuum/posterior_tet10", "tet10", 12.5, 1),
-)
-
-ALL_CASES = CUBES + PUNCHED
-NORMALS = "FEBio's contact acts along the skin's normal, limbfit's along the body's"
-STICKS = "FEBio anchors a point where the first iteration of a step puts it"
-NEVER = math.inf
-
-
 @dataclass(frozen=True)
 class CasePart:
     """``columns`` of ``table`` in the ``spans`` of time, s (start left out), with the ``goal``, percent.
@@ -88,8 +57,8 @@ class CasePart:
     """
 
     name: str
-    columns: tuple[str, ...]
-    spans: tuple[tuple[float, float], ...]
+    columns: Sequence[str]
+    spans: Sequence[Sequence[float]]
     goal: float
     table: str = ""
     note: str = ""
@@ -103,36 +72,11 @@ class SocketCase:
     parts: tuple[CasePart, ...]
 
 
-SOCKET = (
-    SocketCase(
-        "slide",
-        (
-            CasePart("pressing", FORCES, ((0.0, 1.0),), 1.0, note=STICKS),
-            CasePart("sticking to slipping", FORCES, ((1.0, 1.5), (3.0, 3.5)), 3.0, note=NORMALS),
-            CasePart("slipping", FORCES, ((1.5, 3.0), (3.5, NEVER)), 1.0, note=NORMALS),
-        ),
-    ),
-    SocketCase(
-        "cone",
-        (
-            CasePart("pushed on, axial", ("Fz",), ((0.0, 2.5),), 1.0, note=NORMALS),
-            CasePart("pushed on, radial", ("Fx", "Fy"), ((0.0, 2.5),), 1.0, note=NORMALS),
-            CasePart("held, axial", ("Fz",), ((2.5, NEVER),), 3.0, note=STICKS),
-            CasePart("held, radial", ("Fx", "Fy"), ((2.5, NEVER),), 3.0, note=STICKS),
-            CasePart("meridian, pushed on", PLACES, ((0.0, 2.5),), 1.0, "cone-line", NORMALS),
-            CasePart("meridian, held", PLACES, ((2.5, NEVER),), 3.0, "cone-line", STICKS),
-        ),
-    ),
-    SocketCase(
-        "cone-load",
-        (
-            CasePart("loaded by a force", ("z",), ((5.5, 6.5),), 1.0, note=STICKS),
-            CasePart("creep under it", ("z",), ((6.5, 8.5),), 1.0, note=STICKS),
-            CasePart("let go", ("z",), ((8.5, NEVER),), 3.0, note=STICKS),
-            CasePart("meridian under force", PLACES, ((5.5, NEVER),), 3.0, "cone-load-line", STICKS),
-        ),
-    ),
-    SocketCase("tube", (CasePart("meridian", PLACES, ((0.0, NEVER),), 1.0, note="rounding"),)),
+_CASES = tomllib.loads(Path(__file__).with_name("cases.toml").read_text(encoding="utf-8"))
+CUBES, PUNCHED = (tuple(ReferenceCase(**row) for row in _CASES[kind]) for kind in ("cubes", "punched"))
+ALL_CASES = CUBES + PUNCHED
+SOCKET = tuple(
+    SocketCase(name, tuple(CasePart(**part) for part in parts)) for name, parts in _CASES["socket"].items()
 )
 
 

@@ -167,29 +167,29 @@ class SocketSamples(ResultPart):
     failed: Sequence[str] = Field(description="Why others did not.")
 
 
-class SensorCell(ResultPart):
+class PlacedCell(ResultPart):
     """A cell of a sensor in the socket, and what it read."""
 
     cell: str = Field(description="Its name; of a sheet, row and column.")
     state: str = Field(description="`compared`, or why it is not, such as `dead` or `saturated`.")
     position_mm: Vector = Field(description="Its place on the donned socket, LPS.")
+    area_mm2: float = Field(description="Its area.")
     measured_kPa: float | None = Field(description="Mean of its readings; null: it has none.")
 
 
-class PlacedCell(SensorCell):
-    """A cell of a sensor whose pressure may count in the calibration."""
-
-    area_mm2: float = Field(description="Its area.")
-
-
-class PlacedSensor(ResultPart):
-    """A recording of sensors whose cells are placed on the socket."""
+class SensorRecording(ResultPart):
+    """A recording of sensors in the socket."""
 
     name: str = Field(description="Name of the recording.")
     load: str = Field(description="The load that it belongs to.")
+    stretch_percent: float | None = Field(description="How a sheet stretches over the face; null: no sheet.")
+
+
+class PlacedSensor(SensorRecording):
+    """A recording of sensors whose cells are placed on the socket."""
+
     error_kPa: float = Field(description="What 95 % of readings are within, beside the percentage.")
     error_percent: float = Field(description="The part of a reading that 95 % of readings are within.")
-    stretch_percent: float | None = Field(description="How a sheet stretches over the face; null: no sheet.")
     cells: Sequence[PlacedCell] = Field(description="Each cell.")
 
     @property
@@ -214,7 +214,7 @@ class SensorsResult(StoredResult):
     sensors: Sequence[PlacedSensor] = Field(description="Each recording.")
 
 
-class MeasuredCell(SensorCell):
+class MeasuredCell(PlacedCell):
     """What a cell of a sensor read, and what the model has there."""
 
     regions: Sequence[str] = Field(description="Regions of the limb that it lies on, the smallest first.")
@@ -225,12 +225,9 @@ class MeasuredCell(SensorCell):
     interval_kPa: Interval | None = Field(description="95 % interval of that; null: not known.")
 
 
-class SensorComparison(ResultPart):
+class SensorComparison(SensorRecording):
     """A recording of sensors beside the model."""
 
-    name: str = Field(description="Name of the recording.")
-    load: str = Field(description="The load that it belongs to.")
-    stretch_percent: float | None = Field(description="How a sheet stretches over the face; null: no sheet.")
     counts: Mapping[str, int] = Field(description="Number of cells in each state.")
     cells: Sequence[MeasuredCell] = Field(description="Each cell.")
 

@@ -141,11 +141,16 @@ def _name_place(keys: tuple[int | str, ...], content: Any) -> str | None:
 
 @dataclass(frozen=True)
 class UnusedKeys:
-    """Keys without effect if ``when`` is true of the study (and the site): why, and what to do instead."""
+    """Keys without effect if ``when`` is true of the study (and the site): why, and what to give instead."""
 
     when: Callable[..., bool]
     why: str
-    remedy: str = "leave it out"
+    give: str = ""
+
+    @property
+    def remedy(self) -> str:
+        """What to do."""
+        return f"give {self.give}, or leave it out" if self.give else "leave it out"
 
 
 Rules = dict[tuple[str, ...], UnusedKeys]
@@ -198,16 +203,14 @@ UNUSED_KEYS: Rules = {
             and all(site.near is None for site in s.sites)
         ),
         "no site is matched to a marker",
-        "give near instead of position, or leave it out",
+        give="near instead of position",
     ),
     ("geometry.surface_edge_mm",): UnusedKeys(
         lambda s: s.surfaces is not None and s.geometry.amputation is None,
         "given surfaces are used as they are unless they are amputated",
     ),
     ("geometry.amputation_pad_mm",): UnusedKeys(
-        lambda s: s.geometry.amputation is None,
-        "there is no amputation",
-        "give geometry.amputation, or leave it out",
+        lambda s: s.geometry.amputation is None, "there is no amputation", give="geometry.amputation"
     ),
     ("geometry.bone_policy", "geometry.bone_clearance_mm"): UnusedKeys(
         lambda s: s.surfaces is not None and not s.surfaces.bones, "[surfaces] has no bones"
@@ -219,9 +222,7 @@ UNUSED_KEYS: Rules = {
         "every record and every planned indentation names another one",
     ),
     ("traces",): UnusedKeys(
-        lambda s: bool(s.sites) and not s.recorded,
-        "no site has a record",
-        "give sites.trace, or leave it out",
+        lambda s: bool(s.sites) and not s.recorded, "no site has a record", give="sites.trace"
     ),
     ("calibration.relative_tolerance",): UnusedKeys(
         lambda s: s.calibration.stopping == "paper", 'stopping = "paper" has limits of its own'
@@ -234,17 +235,13 @@ UNUSED_KEYS: Rules = {
     ("calibration.prior_tissues",): UnusedKeys(
         lambda s: s.calibration.priors is None,
         "it belongs to the priors of people",
-        'give calibration.priors = "population", or leave it out',
+        give='calibration.priors = "population"',
     ),
     ("calibration.seed",): UnusedKeys(
-        lambda s: s.calibration.starts == 1,
-        "one start is not random",
-        "give calibration.starts, or leave it out",
+        lambda s: s.calibration.starts == 1, "one start is not random", give="calibration.starts"
     ),
     ("calibration.use_socket_pressures",): UnusedKeys(
-        lambda s: not s.socket.measured,
-        "no pressure was measured in the socket",
-        "give [[socket.measured]], or leave it out",
+        lambda s: not s.socket.measured, "no pressure was measured in the socket", give="[[socket.measured]]"
     ),
     ("calibration.search_radius_mm",): UnusedKeys(
         lambda s: s.clamps is not None or bool(s.material.prestretch),
@@ -253,7 +250,7 @@ UNUSED_KEYS: Rules = {
     ("calibration.corrections", "calibration.correction_tolerance_percent"): UnusedKeys(
         lambda s: not s.is_searched_apart,
         "parameters are searched on the meshes themselves, so nothing is corrected",
-        "give calibration.search_radius_mm or [mesh.coarse], or leave it out",
+        give="calibration.search_radius_mm or [mesh.coarse]",
     ),
     tuple(f"uncertainty.{key}" for key in _SOURCE_KEYS): UnusedKeys(
         lambda s: not s.uncertainty.sources, "sources = false leaves it out"
@@ -265,25 +262,23 @@ UNUSED_KEYS: Rules = {
     ("material.relaxation_span_s",): UnusedKeys(
         lambda s: s.material.law != POWER,
         "the tissues' law does not relax as a power of time",
-        f'give material.law = "{POWER}", or leave it out',
+        give=f'material.law = "{POWER}"',
     ),
     ("material.fibres",): UnusedKeys(
         lambda s: not has_fibres(s.material.law),
         "the tissues' law has no fibres",
-        f'give material.law = "{FIBRED}", or leave it out',
+        give=f'material.law = "{FIBRED}"',
     ),
     ("material.activation",): UnusedKeys(
         lambda s: s.material.law != ACTIVE,
         "the tissues' law has no active stress",
-        f'give material.law = "{ACTIVE}", or leave it out',
+        give=f'material.law = "{ACTIVE}"',
     ),
     tuple(f"socket.{key}" for key in _SHAPE_KEYS): UnusedKeys(
         lambda s: s.socket.file is not None, "the socket's shape is that of socket.file"
     ),
     ("socket.unit", "socket.space"): UnusedKeys(
-        lambda s: s.socket.file is None,
-        "it belongs to a socket from a file",
-        "give socket.file, or leave it out",
+        lambda s: s.socket.file is None, "it belongs to a socket from a file", give="socket.file"
     ),
     ("socket.distal_clearance_mm",): UnusedKeys(
         lambda s: s.socket.distal == "bearing", "the distal end bears"
@@ -291,7 +286,7 @@ UNUSED_KEYS: Rules = {
     ("socket.travel_mm",): UnusedKeys(
         lambda s: s.socket.donning == "growth",
         'donning = "growth" has no travel',
-        'give donning = "insertion", or leave it out',
+        give='donning = "insertion"',
     ),
     ("socket.design.adapter_mm",): UnusedKeys(
         lambda s: s.socket.design.adapter_diameter_mm == 0, "a diameter of 0 mm is no adapter"
@@ -305,7 +300,7 @@ UNUSED_KEYS: Rules = {
     ("execution.time_limit_s", "execution.memory_limit_GB"): UnusedKeys(
         lambda s: s.execution.workers == 1,
         "one worker is the process itself, which nothing can stop",
-        "give 2 workers or more, or leave it out",
+        give="2 workers or more",
     ),
 }
 
@@ -330,7 +325,7 @@ UNUSED_SITE_KEYS: Rules = {
     ("indenter",): UnusedKeys(
         lambda s, site: site.trace is None and bool(s.records_at(site)),
         "the site's records are stated in [[records]]",
-        "give it there",
+        give="it there",
     ),
     ("edge",): UnusedKeys(
         lambda s, site: (

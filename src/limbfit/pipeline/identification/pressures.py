@@ -21,7 +21,7 @@ from ...identify.fit.readings import LinearisedReadings, add_scatter
 from ...identify.uncertainty.uncertainty import Uncertainty
 from ...mesh import read_vtu
 from ...results.identification import PressureRound, SocketPressures
-from ...results.socket import PlacedSensor, SensorsResult
+from ...results.socket import PlacedSensor
 from ...socket.sensors import COMPARED
 from ...study import Study
 from ..engine.digests import code_digest, compute_digest
@@ -69,34 +69,25 @@ class PressureSimulator:
     report: Report
 
     @cached_property
-    def stored(self) -> SensorsResult:
-        """The cells on the socket, and what they read."""
-        return self.store.results.sensors
-
-    @cached_property
     def model(self) -> SocketModel:
         """The limb in the socket."""
         limb = SocketLimb.from_store(self.study, self.store)
         socket = build_loadable_socket(self.study, limb.anatomy, limb.outer.skin)
         return limb.build_model(socket, read_vtu(self.store[SENSORS] / MESH))
 
-    @cached_property
-    def kept(self) -> ResultFiles:
-        """Simulations, by their keys."""
-        return ResultFiles(self.folder / RUNS, also=[self.store["calibrate"] / FOLDER / RUNS])
-
     def read_cells(self, parameters: Array, title: str) -> CellReadings:
         """Simulate the socket with these parameters (p,), and compare; what was kept is not done again."""
-        run = SocketRun("calibrate", self.model, self.study.by_tissue(parameters), self.kept, True)
-        sensors = self.stored.sensors
+        kept = ResultFiles(self.folder / RUNS, also=[self.store["calibrate"] / FOLDER / RUNS])
+        run = SocketRun("calibrate", self.model, self.study.by_tissue(parameters), kept, sensitivities=True)
+        sensors = self.store.results.sensors.sensors
 
         def make() -> Made:
             found = solve_run(run, lambda time, end, words: self.report(f"{title}: {words}"))
             return {}, vars(compare_cells(self.model, sensors, found))
 
         cells = [one.to_plain() for one in sensors]
-        _, arrays = self.kept.get(compute_digest(run.key, cells, code_digest(compare_cells)), make)
-        self.kept.drop(run.partial_key)
+        _, arrays = kept.get(compute_digest(run.key, cells, code_digest(compare_cells)), make)
+        kept.drop(run.partial_key)
         return CellReadings(**arrays)
 
 
@@ -137,10 +128,10 @@ def count_pressures(
     Returned are that, what is known of it, and what the pressures told. The simulator's problem counts the
     pressures from then on. Raises `RunError` where the socket cannot be simulated.
     """
-    now, rounds = answer.parameters, list[PressureRound]()
+    now, rounds, edge_mm = answer.parameters, list[PressureRound](), pressures.store.results.sensors.edge_mm
     while True:
         title = f"socket, simulation {len(rounds) + 1}"
-        cells, edge_mm = pressures.read_cells(now, title), pressures.stored.edge_mm
+        cells = pressures.read_cells(now, title)
         covariance, scatter_kPa = add_scatter(cells.covariance, cells.off, cells.position, edge_mm)
         readings = LinearisedReadings.weigh(cells.off, cells.derivatives, covariance, np.log(now))
         simulator.count_readings(readings)

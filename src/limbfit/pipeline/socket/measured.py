@@ -178,9 +178,9 @@ def compare_measured(
             "model_kPa": simulated,
             "interval_kPa": [_scale_interval(p, [rows[name] for name in names]) for p, names in pairs],
         }
-        own = [cell.model_dump(exclude={"area_mm2"}) for cell in placed.cells]
-        more = [dict(zip(columns, values)) for values in zip(*columns.values(), strict=True)]
-        cells = [MeasuredCell(**cell, **beside) for cell, beside in zip(own, more, strict=True)]
+        beside = [dict(zip(columns, values)) for values in zip(*columns.values(), strict=True)]
+        of_cells = zip(placed.cells, beside, strict=True)
+        cells = [MeasuredCell(**cell.model_dump(), **more) for cell, more in of_cells]
         named = placed.model_dump(include={"name", "load", "stretch_percent"})
         sensors.append(SensorComparison(**named, counts=placed.counts, cells=cells))
     return sensors, summarise_agreement(sensors)
