@@ -177,7 +177,7 @@ class PlacedCell(ResultPart):
     measured_kPa: float | None = Field(description="Mean of its readings; null: it has none.")
 
 
-class SensorRecording(ResultPart):
+class SensorRecord(ResultPart):
     """A recording of sensors in the socket."""
 
     name: str = Field(description="Name of the recording.")
@@ -185,7 +185,7 @@ class SensorRecording(ResultPart):
     stretch_percent: float | None = Field(description="How a sheet stretches over the face; null: no sheet.")
 
 
-class PlacedSensor(SensorRecording):
+class PlacedSensor(SensorRecord):
     """A recording of sensors whose cells are placed on the socket."""
 
     error_kPa: float = Field(description="What 95 % of readings are within, beside the percentage.")
@@ -225,7 +225,7 @@ class MeasuredCell(PlacedCell):
     interval_kPa: Interval | None = Field(description="95 % interval of that; null: not known.")
 
 
-class SensorComparison(SensorRecording):
+class SensorComparison(SensorRecord):
     """A recording of sensors beside the model."""
 
     counts: Mapping[str, int] = Field(description="Number of cells in each state.")
