@@ -164,7 +164,7 @@ def run(bench: Bench, seed: int, case: int) -> dict[str, Any]:
             "words": str(error),
             "cpu_s": round(time.process_time() - started, 1),
         }
-    facts = summarise_run(donned.model, found)
+    facts = summarise_run(donned, found)
     (load,) = facts["loads"]
     return row | {
         "outcome": "completed",

@@ -64,10 +64,10 @@ class Bench:
         study = self.study.model_copy(update={"socket": table})
         limb, started = replace(self.limb, study=study), time.process_time()
         values = to_parameters(parameters, study.tissues)
-        model = limb.build_model(self.socket, self.mesh)
-        found = solve_run(SocketRun("", model, values, sensitivities=known), lambda *_: None)
+        run = SocketRun("", limb.build_model(self.socket, self.mesh), values, sensitivities=known)
+        found = solve_run(run, lambda *_: None)
         around = ParameterSpread(self.covariance, np.zeros_like(self.centre)) if known else None
-        load = summarise_run(model, found, around)["loads"][-1]
+        load = summarise_run(run, found, around)["loads"][-1]
         row = {"values": {one["region"]: one["mean_kPa"] for one in load["regions"]}}
         row["values"][SETTLING] = load["settling_mm"]
         row["cpu_s"] = round(time.process_time() - started, 1)

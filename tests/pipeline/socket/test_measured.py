@@ -135,7 +135,11 @@ def test_the_stage_sensors_stores_the_cells_and_the_limb_in_its_socket(tmp_path)
 def test_agreement_is_that_of_bland_and_altman_over_the_cells_that_are_compared():
     def cell(measured: float, model: float, state: str = "compared", **more) -> MeasuredCell:
         place = {"position_mm": (0.0, 0.0, 0.0), "level_mm": 0.0, "angle_deg": 0.0, "interval_kPa": None}
-        own = {"cell": "1", "state": state, "regions": ["crest"], "error_kPa": 1.5, "area_mm2": 100.0} | place | more
+        own = (
+            {"cell": "1", "state": state, "regions": ["crest"], "error_kPa": 1.5, "area_mm2": 100.0}
+            | place
+            | more
+        )
         return MeasuredCell(measured_kPa=measured, model_kPa=model, **own)
 
     cells = [cell(10.0, 11.0), cell(20.0, 22.0, regions=[]), cell(30.0, 33.0, interval_kPa=(30.4, 34.0))]

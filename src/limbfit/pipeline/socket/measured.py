@@ -46,7 +46,7 @@ from ..engine.context import Context
 from ..engine.store import write_result
 from ..simulation.loading import LimbAxis
 from .shape import build_loadable_socket, build_socket, mesh_edge_mm, place_errors
-from .simulation import SocketLimb, SocketModel
+from .simulation import SocketLimb, SocketModel, SocketRun
 
 NAME = "sensors"
 OFF, ALL = "off the socket", "all"  # a cell that the face does not reach, and cells of any region
@@ -156,10 +156,10 @@ def _build_outer_surface(anatomy: Anatomy, liner_mm: float) -> Surface:
 
 
 def compare_measured(
-    limb: SocketLimb, model: SocketModel, found: DonningResult, content: Mapping[str, Any]
+    limb: SocketLimb, run: SocketRun, found: DonningResult, content: Mapping[str, Any]
 ) -> tuple[list[SensorComparison], list[PressureAgreement]]:
     """Compare every recording of a study with a simulation, whose intervals are those of its ``content``."""
-    axis, sensors = LimbAxis(limb.anatomy), []
+    axis, model, sensors = LimbAxis(limb.anatomy), run.model, []
     held = {one["name"]: one for one in content["loads"]} | {"donning": content["donning"]}
     sizes = {name: mask.sum() for name, mask in model.faces.items()}
     for table in limb.study.socket.measured:

@@ -264,7 +264,7 @@ def simulate_socket(run: SocketRun) -> Made:
             for name, held in found.held.items()
             for part in ("pressure", "shear", "displacement")
         }
-        return summarise_run(run.model, found), fields
+        return summarise_run(run, found), fields
 
     made = run.kept.get(run.key, make)
     run.kept.drop(run.partial_key)
@@ -301,10 +301,10 @@ def _describe_stop(found: DonningResult, fit: SocketFit) -> str:
 
 
 def summarise_run(
-    model: SocketModel, found: DonningResult, known: ParameterSpread | None = None
+    run: SocketRun, found: DonningResult, known: ParameterSpread | None = None
 ) -> dict[str, Any]:
     """What is stored of a simulation, with intervals where parameters are ``known`` so well."""
-    names, statistics = found.result.parameter_names, found.result.statistics
+    model, names, statistics = run.model, found.result.parameter_names, found.result.statistics
     fit, spread = model.fit, None if known is None else SimulationSpread.make(model.study, names, known)
     held = {name: _summarise_state(model, one, spread) for name, one in found.held.items()}
     base, loads = found.held["donning"].row, []

@@ -31,7 +31,6 @@ from .measured import compare_measured, describe_measured
 from .shape import build_loadable_socket, check_tissues
 from .simulation import (
     SocketLimb,
-    SocketModel,
     SocketRun,
     run_sockets,
     simulate_socket,
@@ -83,16 +82,16 @@ def run_socket(
     write_surface(folder / "socket.stl", socket.surface)
     mesh, facts = limb.mesh(folder, socket, partial(context.tell, NAME, 0, 0))
     kept = ResultFiles(folder / RUNS, also=[context.store[NAME] / RUNS])
-    model = limb.build_model(socket, mesh)
-    run = SocketRun(NAME, model, parameters, kept, sensitivities=covariance_log is not None)
+    with_slopes = covariance_log is not None
+    run = SocketRun(NAME, limb.build_model(socket, mesh), parameters, kept, sensitivities=with_slopes)
     limb.write_face(socket, folder / "socket-face.vtp")
     found = solve_run(run, partial(context.tell, NAME))
     known = None
     if covariance_log is not None:
         off = np.log(study.vector(most_probable or parameters) / study.vector(parameters))
         known = _build_spread(np.array(covariance_log), off, relaxation, study.socket.worn_s)
-    content = summarise_run(model, found, known)
-    compared = _compare_with_records(limb, model, found, recorded_range)
+    content = summarise_run(run, found, known)
+    compared = _compare_with_records(limb, run, found, recorded_range)
     for held in (content["donning"], *content["loads"]):
         held |= compared[held.get("name", "donning")]
     outside_text, simulated = list[str](), None
@@ -102,7 +101,7 @@ def run_socket(
         if samples:
             steps = [draw_step(np.array(covariance_log), number) for number in range(samples)]
             simulated = _simulate_samples(context, run, content, steps)
-    sensors, agreement = compare_measured(limb, model, found, content)
+    sensors, agreement = compare_measured(limb, run, found, content)
     result = SocketResult(
         **content,
         parameters=parameters,
@@ -110,7 +109,7 @@ def run_socket(
         socket=_describe_shape(limb, socket),
         mesh=facts,
         # All that was found is of transtibial limbs.
-        published=select_published_findings(model.faces) if find_bone(limb.anatomy, "tibia") else [],
+        published=select_published_findings(run.model.faces) if find_bone(limb.anatomy, "tibia") else [],
         samples=simulated,
         worn_s=None if relaxation is None else study.socket.worn_s,
         outside_text=outside_text,
@@ -150,7 +149,7 @@ def _describe_shape(limb: SocketLimb, face: Socket) -> SocketShape:
 
 
 def _compare_with_records(
-    limb: SocketLimb, model: SocketModel, found: DonningResult, stored: Mapping[str, Any] | None
+    limb: SocketLimb, run: SocketRun, found: DonningResult, stored: Mapping[str, Any] | None
 ) -> dict[str, dict[str, Any]]:
     """What donning and each load do to the tissue, and what of it no fitted record did, by name.
 
@@ -160,7 +159,7 @@ def _compare_with_records(
         return {name: {"loading": None, "outside_records": None} for name in found.held}
     tested = RecordedRange.from_stored(RecordedExtents.model_validate(stored))
     axis, before = LimbAxis(limb.anatomy), list[Extent]()
-    mesh, study = model.mesh, model.study
+    mesh, study = run.model.mesh, limb.study
     near_mm = NEAR_MM + study.socket.liner.thickness_mm
     compared, histories = {}, time_socket_loads(study.socket)
     for name, held in found.held.items():
