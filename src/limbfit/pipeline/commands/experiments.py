@@ -87,7 +87,7 @@ _VARIED = ("name", "region", "edge", "depth_mm", "speed_mm_s", "indenter")
 _RECORD = ("site", "name", "indenter")
 # What experiments stand on that choose fitted sites anew, and those of the socket.
 _CHOICES = (_SIMULATED, _CALIBRATED, _FITTED, _RECORD)
-SOCKET = ("surfaces",), ("socket", "geometry", "mesh", "material")
+_SOCKET = ("surfaces",), ("socket", "geometry", "mesh", "material")
 
 _OWN: tuple[Experiment, ...] = (
     Experiment("cube", run_cube, ("calibrate",), ("material",), check=check_cube),
@@ -106,9 +106,9 @@ _OWN: tuple[Experiment, ...] = (
     Experiment("crossvalidate", run_crossvalidate, *_CHOICES, check=check_crossvalidate),
     Experiment("design", run_design, _MESHED, _CALIBRATED, _PLANNED, _RECORD, check=check_design),
     Experiment("protocol", run_protocol, _MESHED, _ACQUIRED, _PLANNED, _RECORD, check=check_protocol),
-    Experiment("socket", run_socket, *SOCKET, apart=("socket.design",), check=check_socket),
+    Experiment("socket", run_socket, *_SOCKET, apart=("socket.design",), check=check_socket),
     Experiment(
-        "socket_design", run_socket_design, *SOCKET, apart=("socket.measured",), check=check_socket_design
+        "socket_design", run_socket_design, *_SOCKET, apart=("socket.measured",), check=check_socket_design
     ),
 )
 EXPERIMENTS = Registry("experiment", {experiment.name: experiment for experiment in _OWN})

@@ -42,7 +42,7 @@ from ..records.secondary_measurements import read_motion
 from ..records.traces import run_traces
 from ..simulation.limb_geometry import LimbGeometry
 from ..socket.measured import run_sensors
-from .experiments import EXPERIMENTS, SOCKET, check_experiment, compute_experiment_key, list_experiment_states
+from .experiments import EXPERIMENTS, check_experiment, compute_experiment_key, list_experiment_states
 from .report import run_report
 
 _PLACE = ("name", "position", "near", "axis", "edge", "region", "fitted", "indenter")
@@ -53,6 +53,7 @@ _NAMED = ("site", "name")
 # Of tables of the mesh: how pins press (how wide they are counts), and how long a mesh may take to be made.
 _PRESSING = ("force_N", "angles_degrees", "levels_mm", "clamping_s", "settling_s")
 _NO_SHAPE = (*(f"clamps.{key}" for key in _PRESSING), "mesh.time_limit_s")
+_NOT_SENSED = ("socket.design", "socket.worn_s")  # of a socket as its sensors measured
 
 STAGES = (
     Stage("segment", run_segment, (), ("image", "segmentation")),
@@ -62,7 +63,7 @@ STAGES = (
     Stage(
         "mesh", run_mesh, ("surfaces", "sites"), ("geometry", "mesh", "clamps"), ("name",), apart=_NO_SHAPE
     ),
-    Stage("sensors", run_sensors, *SOCKET, apart=("socket.design", "socket.worn_s")),
+    Stage("sensors", run_sensors, ("surfaces",), ("socket", "geometry", "mesh"), apart=_NOT_SENSED),
     Stage(
         "calibrate",
         run_calibrate,
