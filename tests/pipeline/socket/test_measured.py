@@ -129,6 +129,10 @@ def test_the_stage_sensors_stores_the_cells_and_the_limb_in_its_socket(tmp_path)
     (cell,) = one.cells
     assert (cell.state, cell.area_mm2, cell.measured_kPa) == ("compared", 100.0, 25.0)
     assert len(read_vtu(study.results / "sensors" / "limb.vtu").cells) > 100
+    cells = tmp_path / "cells.csv"
+    cells.write_text(cells.read_text().replace(",25\n", ",\n"))
+    with pytest.raises(InputError, match=r"socket.measured: no cell can be compared"):
+        run_study(load_study(tmp_path), until="sensors")
     assert "sensors" not in {row["stage"] for row in study_status(load_study(small_limb(tmp_path, BARE)))}
 
 

@@ -53,8 +53,8 @@ OFF, ALL = "off the socket", "all"  # a cell that the face does not reach, and c
 # Points of a disc of radius 1, and their weights: exact to the fifth order (Abramowitz and Stegun, 25.4.61).
 _TURNS = np.radians(60.0 * np.arange(6))
 DISC = np.vstack([[0.0, 0.0], np.sqrt(2.0 / 3.0) * np.column_stack([np.cos(_TURNS), np.sin(_TURNS)])])
-_READ = ("area_mm2", "measured_kPa")  # of a cell
 WEIGHTS = np.array([1 / 4, *[1 / 8] * 6])
+_READ = ("area_mm2", "measured_kPa")  # of a cell
 
 
 def read_sensors(study: Study, table: MeasuredTable) -> SensorFrames:
@@ -113,7 +113,8 @@ def place_sensors(
 def run_sensors(context: Context, folder: Path) -> None:
     """Draw the socket around the limb, place the cells of its sensors on it, and mesh the limb in it.
 
-    The mesh of an interrupted run is kept. Errors as `build_loadable_socket` and `place_sensors`.
+    The mesh of an interrupted run is kept. Raises `StudyError` where no cell can be compared, and errors as
+    `build_loadable_socket` and `place_sensors`.
     """
     study, limb = context.study, SocketLimb.from_store(context.study, context.store)
     socket = build_loadable_socket(study, limb.anatomy, limb.outer.skin)
@@ -121,6 +122,8 @@ def run_sensors(context: Context, folder: Path) -> None:
     sensors = [place_sensors(study, table, socket, limb.anatomy, outer) for table in tables]
     for one in sensors:
         context.tell(NAME, 0, 0, f"{one.name}: {one.words}")
+    if not any(COMPARED in one.counts for one in sensors):
+        raise StudyError("no cell can be compared", file=study.file, place="socket.measured")
     _, facts = limb.mesh(folder, socket, partial(context.tell, NAME, 0, 0))
     limb.write_face(socket, folder / "socket-face.vtp")
     content = SensorsResult(edge_mm=mesh_edge_mm(study, socket), mesh=facts, sensors=sensors)
