@@ -50,7 +50,7 @@ def test_phantom_with_all_four_bones():
     limb = make_limb(1)
     where = make_grid(limb, "coarse", 1)
     array = np.concatenate([slab for _, slab in generate_slabs(limb, where, (), 1)])
-    image = Volume(array, *where.geometry)
+    image = Volume(array, where.spacing, where.origin, where.direction)
     labels = segment(image)
     points = where.points(*(slice(0, n) for n in array.shape))
     assert dice(labels.limb, limb.skin(points) < 0) > 0.98
