@@ -109,7 +109,7 @@ def bench_of(name: str, folder: Path, shared: Path) -> Bench:
     study = limbfit.load_study(folder)
     limbfit.run_study(study, until="surfaces")
     context = Context(study, Store(study.results), SerialExecutor(), ignore_progress)
-    limb = SocketLimb.from_store(study, context.store)
+    limb = SocketLimb.from_store(study, context.store, print)
     plain = build_socket(study, limb.anatomy, limb.outer.skin)
     return Bench(name, study, limb, limb.mesh(folder, plain, print)[0], plain)
 

@@ -52,7 +52,7 @@ class Bench:
         self.covariance = np.array(found["uncertainty"]["covariance_log"])
         self.centre = to_vector(found["stages"][-1]["parameters"], study.tissues)
         self.off = np.log(to_vector(found["uncertainty"]["most_probable"], study.tissues) / self.centre)
-        self.limb = SocketLimb.from_store(study, context.store)
+        self.limb = SocketLimb.from_store(study, context.store, print)
         self.socket: Socket = build_socket(study, self.limb.anatomy, self.limb.outer.skin)
         self.mesh: Mesh = self.limb.mesh(folder, self.socket, print)[0]
 

@@ -26,7 +26,7 @@ def test_the_package_holds_the_socket(tmp_path: Path) -> None:
     study = load_study(small_limb(tmp_path, SOCKET))
     run_study(study, until="surfaces")
     context = Context(study, Store(study.results), SerialExecutor(), lambda event: None)
-    limb = SocketLimb.from_store(study, context.store)
+    limb = SocketLimb.from_store(study, context.store, print)
     _, face = build_undeformed_socket(study, limb.anatomy, limb.outer.skin, ())
     wall = build_socket_wall(study, limb.anatomy, face)
     package = write_shop_package(tmp_path, limb, face, wall)

@@ -34,9 +34,9 @@ from .search import RecordSimulator, Report
 
 FOLDER = "socket"
 MAX_ROUNDS = 4
-_STEP = 1e-4  # of a parameter's logarithm, for derivatives
 TOLERANCE_SD = 0.3  # of what all pressures together tell: it is enough that they move by less
 NOT_SETTLED = "the parameters still moved when the socket had been simulated as often as it may be"
+_STEP = 1e-4  # of a parameter's logarithm, for derivatives
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +70,7 @@ class PressureSimulator:
     @cached_property
     def model(self) -> SocketModel:
         """The limb in the socket."""
-        limb = SocketLimb.from_store(self.study, self.store)
+        limb = SocketLimb.from_store(self.study, self.store, self.report)
         socket = build_loadable_socket(self.study, limb.anatomy, limb.outer.skin)
         return limb.build_model(socket, read_vtu(self.store[SENSORS] / MESH))
 

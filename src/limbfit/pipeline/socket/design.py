@@ -95,9 +95,10 @@ def run_socket_design(
         context.tell(NAME, done, total, words)
 
     with shape.place_errors(study, PLACE):
-        limb, target = SocketLimb.from_store(context.study, context.store), shape.build_target(study)
+        report, target = partial(context.tell, NAME, 0, 0), shape.build_target(study)
+        limb = SocketLimb.from_store(study, context.store, report)
         plain, face = build_undeformed_socket(study, limb.anatomy, limb.outer.skin, optimise)
-        mesh, facts = limb.mesh(folder, face, partial(context.tell, NAME, 0, 0))
+        mesh, facts = limb.mesh(folder, face, report)
         kept = ResultFiles(folder / RUNS, also=[context.store[NAME] / RUNS])
         unloaded = SocketRun("", limb.build_model(face, mesh), parameters, kept)
         recipe = _compute_pressed_recipe(limb, unloaded, plain, target, tell)

@@ -116,15 +116,16 @@ def run_sensors(context: Context, folder: Path) -> None:
     The mesh of an interrupted run is kept. Raises `StudyError` where no cell can be compared, and errors as
     `build_loadable_socket` and `place_sensors`.
     """
-    study, limb = context.study, SocketLimb.from_store(context.study, context.store)
+    study, tell = context.study, partial(context.tell, NAME, 0, 0)
+    limb = SocketLimb.from_store(study, context.store, tell)
     socket = build_loadable_socket(study, limb.anatomy, limb.outer.skin)
     tables, outer = study.socket.measured, limb.outer.skin
     sensors = [place_sensors(study, table, socket, limb.anatomy, outer) for table in tables]
     for one in sensors:
-        context.tell(NAME, 0, 0, f"{one.name}: {one.words}")
+        tell(f"{one.name}: {one.words}")
     if not any(COMPARED in one.counts for one in sensors):
         raise StudyError("no cell can be compared", file=study.file, place="socket.measured")
-    _, facts = limb.mesh(folder, socket, partial(context.tell, NAME, 0, 0))
+    _, facts = limb.mesh(folder, socket, tell)
     limb.write_face(socket, folder / "socket-face.vtp")
     content = SensorsResult(edge_mm=mesh_edge_mm(study, socket), mesh=facts, sensors=sensors)
     write_result(folder / f"{NAME}.json", content)

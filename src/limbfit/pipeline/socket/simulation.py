@@ -68,12 +68,13 @@ class SocketLimb:
     fibres: tuple[tuple[str, Direction], ...]
 
     @classmethod
-    def from_store(cls, study: Study, store: Store) -> SocketLimb:
-        """That of a study whose surfaces are stored."""
+    def from_store(cls, study: Study, store: Store, report: Callable[..., None]) -> SocketLimb:
+        """That of a study whose surfaces are stored; ``report`` is given a line where a liner is made."""
         surfaces, thickness = store["surfaces"], study.socket.liner.thickness_mm
         outer = anatomy = load_anatomy(surfaces)
         depth = read_stored_depth(surfaces, anatomy, mesh_settings(study))
         if thickness:
+            report(f"a liner of {thickness:g} mm around the limb")
             outer, depth = build_liner_surface(anatomy, thickness, depth)
         fibres = find_fibre_directions(study, store.results)
         return cls(study, anatomy, outer, depth, build_regions(study, anatomy), fibres)
@@ -159,6 +160,17 @@ class SocketModel:
         laws = build_materials(parameters, kappa, table.law, fibres, table.relaxation_span_s)
         return laws | build_materials({LINER: liner.parameters}, kappa) if liner.thickness_mm else laws
 
+    @cached_property
+    def digest(self) -> str:
+        """Of all that decides what the socket does to the limb, but for the parameters of its tissues."""
+        study, mesh, face = self.study, self.mesh, self.face
+        return compute_digest(
+            *(study.material.model_dump(mode="json"), study.socket.liner.model_dump(mode="json")),
+            *(mesh.points, mesh.cells, mesh.regions, mesh.region_names, mesh.held, mesh.face_sets[OUTER]),
+            *(face.points, face.faces, face.clear, asdict(self.fit), self.faces, self.fibres),
+            *(compute_extensions_digest(study.extensions), code_digest(solve_run)),
+        )
+
 
 @dataclass(frozen=True, eq=False)
 class SocketRun:
@@ -176,15 +188,8 @@ class SocketRun:
 
     @cached_property
     def key(self) -> str:
-        """Of all that decides what the socket does to the limb."""
-        study, mesh, face, model = self.model.study, self.model.mesh, self.model.face, self.model
-        return compute_digest(
-            *(study.material.model_dump(mode="json"), study.socket.liner.model_dump(mode="json")),
-            *(mesh.points, mesh.cells, mesh.regions, mesh.region_names, mesh.held, mesh.face_sets[OUTER]),
-            *(face.points, face.faces, face.clear, asdict(model.fit), model.faces, model.fibres),
-            *(self.parameters, self.sensitivities),
-            *(compute_extensions_digest(study.extensions), code_digest(solve_run)),
-        )
+        """Of all that decides what comes of it."""
+        return compute_digest(self.model.digest, self.parameters, self.sensitivities)
 
     @property
     def partial_key(self) -> str:

@@ -29,14 +29,7 @@ from ..simulation.loading import NEAR_MM, LimbAxis, describe_socket_load, name_l
 from .intervals import CHANGE_PERCENT, FRICTION, ParameterSpread, draw_step, store_change, widen_intervals
 from .measured import compare_measured, describe_measured
 from .shape import build_loadable_socket, check_tissues
-from .simulation import (
-    SocketLimb,
-    SocketRun,
-    run_sockets,
-    simulate_socket,
-    solve_run,
-    summarise_run,
-)
+from .simulation import SocketLimb, SocketRun, run_sockets, simulate_socket, solve_run, summarise_run
 
 NAME = "socket"
 NOT_COMPARED = (
@@ -77,10 +70,11 @@ def run_socket(
     samples : draws from it that are simulated too, and more friction; the intervals then count what
         derivatives miss.
     """
-    study, limb = context.study, SocketLimb.from_store(context.study, context.store)
+    study, tell = context.study, partial(context.tell, NAME, 0, 0)
+    limb = SocketLimb.from_store(study, context.store, tell)
     socket = build_loadable_socket(study, limb.anatomy, limb.outer.skin)
     write_surface(folder / "socket.stl", socket.surface)
-    mesh, facts = limb.mesh(folder, socket, partial(context.tell, NAME, 0, 0))
+    mesh, facts = limb.mesh(folder, socket, tell)
     kept = ResultFiles(folder / RUNS, also=[context.store[NAME] / RUNS])
     with_slopes = covariance_log is not None
     run = SocketRun(NAME, limb.build_model(socket, mesh), parameters, kept, sensitivities=with_slopes)
